@@ -222,9 +222,11 @@ def _field(store: Typestore, name: str, kind: Any) -> Field:
 
 def same_layout(store: Typestore, name: str) -> bool:
     """Return whether a type has exactly the fields of the known one, in their order."""
-    wanted = typestore().fielddefs[name][1]
-    return store.fielddefs[name][1] == wanted and all(
-        same_layout(store, inner) for _, (_, inner) in wanted if isinstance(inner, str)
+    known_fields = typestore().fielddefs[name][1]
+    return store.fielddefs[name][1] == known_fields and all(
+        same_layout(store, inner)
+        for _, (_, inner) in known_fields
+        if isinstance(inner, str)
     )
 
 
@@ -257,14 +259,14 @@ def other_field(store: Typestore, name: str, last: str) -> str:
     """
     type_of_field = dict(store.fielddefs[name][1])
     required = True
-    for part, wanted in typestore().fielddefs[name][1]:
+    for part, known_type in typestore().fielddefs[name][1]:
         if part not in type_of_field and required:
             return f"no field '{part}'"
         if part in type_of_field and _free_of_bounds(
             type_of_field[part]
-        ) != _free_of_bounds(wanted):
+        ) != _free_of_bounds(known_type):
             return f"the field '{part}' has another type"
-        inner = wanted[1]
+        inner = known_type[1]
         if isinstance(inner, str) and part in type_of_field:  # a type of its own
             difference = other_field(
                 store, inner, typestore().fielddefs[inner][1][-1][0]

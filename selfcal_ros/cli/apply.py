@@ -82,13 +82,13 @@ def run(args: argparse.Namespace) -> int:
     table = distances if points.shape[1] == len(ENDS) else corrected
     text, unknown, outside = table(stage, points, inverse=args.inverse, edge=edge)
     _say_better(stage, points)
-    left = (
+    treatment = (
         "corrected as the nearest point of its edge, where u is not known"
         if edge
         else "left empty (--outside edge corrects them as the nearest point of its edge)"
     )
     for count, what in (
-        (outside, f"outside the field, {left}"),
+        (outside, f"outside the field, {treatment}"),
         (unknown, "next to unknown sites or lines, left empty"),
     ):
         if count:

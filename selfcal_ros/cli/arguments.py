@@ -139,16 +139,18 @@ def check_existing(args: argparse.Namespace) -> None:
 
 def _refuse_ending(path: str, metavar: str) -> None:
     """Raise InputError if the name of an output ends as that of a file of another kind."""
-    wanted, ending = (os.path.splitext(name)[1].lower() for name in (metavar, path))
+    expected_ending, ending = (
+        os.path.splitext(name)[1].lower() for name in (metavar, path)
+    )
     if (
-        wanted in FORMATS
+        expected_ending in FORMATS
         and ending in OTHERS
-        and ending not in (wanted, *FORMATS[wanted])
+        and ending not in (expected_ending, *FORMATS[expected_ending])
     ):
         raise InputError(
             path,
             f"{metavar} is written here, which is not {ending}",
-            f"end the name in {wanted}",
+            f"end the name in {expected_ending}",
         )
 
 
@@ -180,17 +182,17 @@ def misplaced(args: argparse.Namespace) -> InputError | None:
 def _files(args: argparse.Namespace) -> Iterator[File]:
     """Yield the inputs among the arguments that are files or folders."""
     for action in args.leaf._actions:
-        wanted = tuple(
+        kinds_wanted = tuple(
             WANTED[name] for name in str(action.metavar).split("|") if name in WANTED
         )
         values = getattr(args, action.dest, None)
         for value in values if isinstance(values, list) else [values]:
             if (
-                wanted
+                kinds_wanted
                 and isinstance(value, str)
                 and not OUTPUTS.intersection(action.option_strings)
             ):
-                yield File(value, wanted, kind_of(value))
+                yield File(value, kinds_wanted, kind_of(value))
 
 
 def kind_of(path: str) -> str:

@@ -250,10 +250,12 @@ def _at_another_time(e: Evidence) -> str | None:
     half = sum(len(stage) for stage, _ in placed) / 2
     for steps, late in product(range(1, LATE + 1), (True, False)):
         at, of = (slice(None, -steps), slice(steps, None))[:: 1 if late else -1]
-        apart = np.concatenate([np.abs(stage[at] - axis[of]) for stage, axis in placed])
-        if len(apart) < half:
+        distance = np.concatenate(
+            [np.abs(stage[at] - axis[of]) for stage, axis in placed]
+        )
+        if len(distance) < half:
             break
-        if np.quantile(apart, NEARLY_ALL) * e.pitch_m <= e.limit_m:
+        if np.quantile(distance, NEARLY_ALL) * e.pitch_m <= e.limit_m:
             detections = "1 detection" if steps == 1 else f"{steps} detections"
             return (
                 f"at the stamp of a mark the stage stands where the mark {detections} "

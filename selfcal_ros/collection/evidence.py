@@ -182,7 +182,7 @@ class DetectionsSeen:
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
         plate = self.artifact
         outside = unknown >= AT_LEAST and unknown > MOST * bad
-        asked = _planned_marks(
+        rows_planned = _planned_marks(
             plate, [view.view for view in views.values() if view.view.grid]
         )
         cells = [cell for view in views.values() for cell in view.parts]
@@ -190,7 +190,7 @@ class DetectionsSeen:
             asked_rows.difference(
                 *(np.unique(getattr(cell, axis)).tolist() for cell in cells)
             )
-            for axis, asked_rows in zip("mn", asked, strict=True)
+            for axis, asked_rows in zip("mn", rows_planned, strict=True)
         ]
         if plate.marks is not None or not (outside or any(unread)):
             return None
@@ -207,13 +207,13 @@ class DetectionsSeen:
         if len(np.unique(view_of)) < 2:  # rows that are missing may follow
             seen_rows = [
                 rows | asked_rows
-                for rows, asked_rows in zip(seen_rows, asked, strict=True)
+                for rows, asked_rows in zip(seen_rows, rows_planned, strict=True)
             ]
         if not all(seen_rows) or any(
             max(rows) - min(rows) + 1 != len(rows) for rows in seen_rows
         ):
             return None
-        sides, planned = (tuple(map(len, rows)) for rows in (seen_rows, asked))
+        sides, planned = (tuple(map(len, rows)) for rows in (seen_rows, rows_planned))
         on_plate = all(
             low <= min(rows) and max(rows) <= high
             for rows, (low, high) in zip(seen_rows, plate.limits, strict=True)

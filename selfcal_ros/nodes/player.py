@@ -320,10 +320,10 @@ class Player:
     def _on_taken(self, message: Any) -> None:
         if len(message.data) != len(("taken", "found", "matched")):
             return
-        taken, self.found, self.matched = map(int, message.data)
-        if taken < (self.taken or 0):  # a detector that was restarted
-            self._taken_before = taken - self.sent[IMAGES]
-        self.taken = taken
+        n_taken, self.found, self.matched = map(int, message.data)
+        if n_taken < (self.taken or 0):  # a detector that was restarted
+            self._taken_before = n_taken - self.sent[IMAGES]
+        self.taken = n_taken
 
     def drain(self) -> None:
         """Wait until everything has been acknowledged."""

@@ -58,13 +58,13 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
     images : sequence of float arrays (k, 2)
         Places of the marks, px.
     """
-    apart = [
+    distances_px = [
         float(np.hypot(*(places[i] - places[j])))
         for places in images
         for i in range(len(places))
         for j in range(i)
     ]
-    limit = min(apart) / 2 if apart else np.inf
+    limit = min(distances_px) / 2 if distances_px else np.inf
     numbers: list[np.ndarray] = []
     count = 0
     before = np.zeros((0, 2))

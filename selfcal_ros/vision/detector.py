@@ -292,12 +292,12 @@ class MarkDetector:
             Reason -> possible marks that were rejected in all of them.
         """
         settings = self.settings
-        wanted = (
+        none_found = (
             f"no {'' if self._sign == 0 else settings.polarity + ' '}{settings.mark} of "
             f"{self.size:.3g} px was found"
         )
         reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
-        summary = wanted + (f"; rejected: {reasons}" if reasons else "")
+        summary = none_found + (f"; rejected: {reasons}" if reasons else "")
         spots = None if picture is None else spots_in(picture.values)
         if spots is None:
             return f"{summary}; nothing repeats in them", "check exposure and focus"

@@ -167,11 +167,13 @@ def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
     """
     days, changes, u = [], [], []
     for entry in entries:
-        apart = abs((entry.measured - active.measured).total_seconds()) / S_PER_DAY
+        days_between = (
+            abs((entry.measured - active.measured).total_seconds()) / S_PER_DAY
+        )
         change = _change(active, entry)
-        if isinstance(change, str) or not apart or change.xy is None:
+        if isinstance(change, str) or not days_between or change.xy is None:
             continue
-        days.append(apart)
+        days.append(days_between)
         u.append(change.xy.u_rms)
         changes.append(math.sqrt(max(change.rms_m**2 - change.xy.u_rms**2, 0.0)))
     if not days:

@@ -201,7 +201,7 @@ def _solution(
     is_linear = is_linear.ravel()
     free = geometry.free.ravel()
     gain = gain_of_all[: free.sum()]
-    left = (
+    residual_by_reading = (
         np.eye(len(by_errors)) - np.hstack([by_errors[:, free], by_tilt]) @ gain_of_all
     )
     by_readings = np.zeros((free.size, gain.shape[1]))
@@ -215,6 +215,6 @@ def _solution(
         by_readings=by_readings,
         by_linear=by_linear,
         residuals_m=data.readings_m - geometry.readings(errors, tilt),
-        residuals_by_readings=left,
-        residuals_by_linear=-left @ by_errors[:, is_linear],
+        residuals_by_readings=residual_by_reading,
+        residuals_by_linear=-residual_by_reading @ by_errors[:, is_linear],
     )

@@ -331,23 +331,24 @@ def _contradiction(
     expected_m, probability = by_noise
     if probability > CONTRADICTION:
         return ""
-    found = (
+    contradiction = (
         f"the readings of the diagonals contradict each other by "
         f"{residual_m * UM_PER_M:.3g} um rms, where their repeats allow "
         f"{expected_m * UM_PER_M:.3g} um; errors are beyond their u: "
     )
     samples = data.samples_m.copy()
     samples[:, data.signs < 0] = samples[:, data.signs < 0][:, :, ::-1]
-    other = replace(data, samples_m=samples)
-    otherwise = residuals_by_noise(other, adjust(other))
+    reversed_data = replace(data, samples_m=samples)
+    otherwise = residuals_by_noise(reversed_data, adjust(reversed_data))
     if otherwise and otherwise[1] > CONTRADICTION:
         return (
-            found
+            contradiction
             + "in the other order the blocks of the axes that run backwards (rx_np) agree; "
             "a block is a position on the axis, not a time"
         )
     return (
-        found + "the machine or the set-up changed between the runs, the mirror turned "
+        contradiction
+        + "the machine or the set-up changed between the runs, the mirror turned "
         "with the axes, or blocks are not in the order of their positions"
     )
 

@@ -273,10 +273,10 @@ def residuals_by_noise(
         return None
     expected = float(np.trace(covariance))
     dof = expected**2 / float(np.sum(covariance**2))
-    found = float(np.sum(adjusted.residuals_m**2))
+    squares = float(np.sum(adjusted.residuals_m**2))
     noises = (reading_noise(data), linear_noise(data))
-    known = min(noise.dof for noise in noises if noise.dof)
-    probability = float(f_distribution.sf(found / expected, dof, known))
+    dof_noise = min(noise.dof for noise in noises if noise.dof)
+    probability = float(f_distribution.sf(squares / expected, dof, dof_noise))
     return float(np.sqrt(expected / adjusted.residuals_m.size)), probability
 
 

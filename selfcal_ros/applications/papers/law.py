@@ -480,9 +480,9 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
 
 def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> None:
     size, lines = artifact.grid_size, artifact.angular_count
-    wanted = {2: 0, 3: size * (size - 1)}.get(index, size * size)
+    n_marks = {2: 0, 3: size * (size - 1)}.get(index, size * size)
     for what, have, want in (
-        ("grid marks", len(view.m), wanted),
+        ("grid marks", len(view.m), n_marks),
         ("angular lines", len(view.k), lines),
     ):
         if have != want:

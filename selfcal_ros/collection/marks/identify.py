@@ -209,7 +209,9 @@ def _nearest(
         away, two = artifact.marks.tree.query(
             np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2
         )
-        apart = distances(np.diff(artifact.marks.places_m[:, two], axis=2)[:, :, 0])
+        between_marks_m = distances(
+            np.diff(artifact.marks.places_m[:, two], axis=2)[:, :, 0]
+        )
         mark = np.stack(
             [artifact.marks.id_array[two[:, 0]], np.zeros(len(two), dtype=int)]
         )
@@ -217,7 +219,7 @@ def _nearest(
             mark,
             away[:, 0] / np.maximum(away[:, 1], 1e-12 * pitch),
             away[:, 0],
-            apart,
+            between_marks_m,
         )
     (first_m, last_m), (first_n, last_n) = artifact.limits
     step = centred / pitch

@@ -332,9 +332,11 @@ def _pair_scale(
                 if alike
                 else np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
             )
-            apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
-            differences[filled : filled + apart.size] = (np.abs(apart) / norm).ravel()
-            filled += apart.size
+            of_pairs = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
+            differences[filled : filled + of_pairs.size] = (
+                np.abs(of_pairs) / norm
+            ).ravel()
+            filled += of_pairs.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(
         values
     )

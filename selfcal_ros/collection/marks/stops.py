@@ -227,14 +227,14 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
     Two of the four check stops coincide along each axis, so the lower quartile of the
     differences of readings of a mark, and the better axis, represent ordinary stops.
     """
-    apart = [np.zeros((2, 0))]
+    of_groups = [np.zeros((2, 0))]
     for group in groups_of(key):
         some = group[:: -(-len(group) // LOOKED_AT)]
         i, j = pairs_of(some.shape[1])
-        apart.append(
+        of_groups.append(
             np.abs(place_m[:, some[:, i]] - place_m[:, some[:, j]]).reshape(2, -1)
         )
-    differences_m = np.concatenate(apart, axis=1)
+    differences_m = np.concatenate(of_groups, axis=1)
     return (
         float(np.quantile(differences_m, 0.25, axis=1).min()) / QUARTILE
         if differences_m.size

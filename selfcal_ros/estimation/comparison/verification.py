@@ -488,8 +488,8 @@ def _of_factors(factors: list[tuple[float, float]]) -> TableFault:
         return kinds.pop() if len(kinds) == 1 else TableFault.AXES_DIFFER
     kind_shown = [(value, u) for value, u in factors if _kind(value, u)]
     values, u = np.transpose(kind_shown)
-    apart = float(values.max() - values.min())
-    if apart <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
+    spread = float(values.max() - values.min())
+    if spread <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
         return TableFault.FACTOR
     return (
         TableFault.OLDER if abs(values - 1).max() < SHARED else TableFault.AXES_DIFFER

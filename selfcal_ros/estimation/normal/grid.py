@@ -86,9 +86,9 @@ class GridSystem(PlateEliminated):
         differences = []
         for first in dict.fromkeys(self.rotations):
             views = np.flatnonzero(np.array(self.rotations) == first)
-            apart = np.zeros((3 * self.n_views, len(views) - 1))
-            apart[3 * views] = helmert(len(views)).T
-            differences.append(apart)
+            between_views = np.zeros((3 * self.n_views, len(views) - 1))
+            between_views[3 * views] = helmert(len(views)).T
+            differences.append(between_views)
         return np.hstack([np.zeros((3 * self.n_views, 0)), *differences])
 
     @property
@@ -98,12 +98,12 @@ class GridSystem(PlateEliminated):
 
     def tied(self, normal: np.ndarray) -> np.ndarray:
         """Return a normal matrix of misalignments with `differences` without information."""
-        apart = self.differences
-        if apart.shape[1]:
-            n = len(apart)
+        differences = self.differences
+        if differences.shape[1]:
+            n = len(differences)
             normal = normal.copy()
-            normal[:n] -= apart @ (apart.T @ normal[:n])
-            normal[:, :n] -= (normal[:, :n] @ apart) @ apart.T
+            normal[:n] -= differences @ (differences.T @ normal[:n])
+            normal[:, :n] -= (normal[:, :n] @ differences) @ differences.T
         return normal
 
     @cached_property

@@ -370,10 +370,10 @@ def _missing_lines(artifact: Artifact, turns: list[float]) -> list[View]:
         )
         best = best_turn_deg(np.array(turns) * (2 * np.pi / count), artifact.harmonics)
         return [View("", math.radians(best), grid=False)] if lacks.missed else []
-    apart = [round(turn - turns[0]) for turn in turns]
+    turns_between = [round(turn - turns[0]) for turn in turns]
     return (
         [View("", 2 * math.pi / count, grid=False)]
-        if math.gcd(count, *apart) > 1
+        if math.gcd(count, *turns_between) > 1
         else []
     )
 

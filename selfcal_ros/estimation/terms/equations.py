@@ -50,7 +50,7 @@ class ReducedColumns:
         Right-hand side s of every shape.
     inner : complex array (q, q)
         Weighted inner products of the shapes' residuals after marks and sites.
-    asked : complex array (2 views, q)
+    misalignments : complex array (2 views, q)
         Coupling of the shapes to rotation and offset of every view, sites eliminated.
     """
 
@@ -58,7 +58,7 @@ class ReducedColumns:
     shapes: Shapes
     sites: np.ndarray
     inner: np.ndarray
-    asked: np.ndarray
+    misalignments: np.ndarray
 
     @cached_property
     def free(self) -> np.ndarray:
@@ -68,7 +68,7 @@ class ReducedColumns:
     @cached_property
     def right(self) -> np.ndarray:
         """Right-hand side of the misalignments, (3 views, p)."""
-        return of_misalignments(self.shapes.of_columns(self.asked))
+        return of_misalignments(self.shapes.of_columns(self.misalignments))
 
     @cached_property
     def gram(self) -> np.ndarray:

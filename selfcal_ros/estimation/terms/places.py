@@ -227,18 +227,18 @@ def places_of(
             marks.append(None)
             about.append(None)
             continue
-        stood = (
+        offset_from_target = (
             read_visits.dx
             - read_visits.offset_x
             + 1j * (read_visits.dy - read_visits.offset_y)
         )
-        mean = visits.means(stood[None], grid.y[0].size)[0]
+        mean = visits.means(offset_from_target[None], grid.y[0].size)[0]
         away[row], located[row].reshape(-1)[visits.mark] = (
             mean.reshape(grid.y.shape[1:]),
             True,
         )
         marks.append(visits.mark)
-        about.append(stood - mean[visits.mark])
+        about.append(offset_from_target - mean[visits.mark])
     located &= views.near(known_sites) & (grid.weight > 0)
     pitch_m = inputs.half_width_m / views.unit * views.node_pitch
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:

@@ -22,12 +22,12 @@ def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the view that differs most from all others: a common rotation belongs to the datum."""
     n = len(estimates.values)
     unit = np.eye(len(estimates.values))
-    apart = []
+    distinctness = []
     for at in range(n):
         differences = [
             unit[at] - unit[another] for another in range(n) if another != at
         ]
-        apart.append(
+        distinctness.append(
             min(
                 (
                     abs(estimates.values @ weights) / _u(estimates, weights)
@@ -36,10 +36,10 @@ def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
                 default=0.0,
             )
         )
-    at = int(np.argmax(apart))
+    at = int(np.argmax(distinctness))
     weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
     # u is that of the difference from the nearest
-    nearest = abs(float(estimates.values @ weights)) / max(apart[at], 1e-300)
+    nearest = abs(float(estimates.values @ weights)) / max(distinctness[at], 1e-300)
     yield (
         {
             "view": names[estimates.columns[at].view],

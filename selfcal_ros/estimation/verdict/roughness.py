@@ -160,9 +160,11 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
                     0.0,
                 )
             )
-            p, apart = min(p, likelier), _apart(refit, model)
+            p, power_refit = min(p, likelier), _apart(refit, model)
             power = (
-                apart if likelier < F_LEVEL and apart.mean() > power.mean() else power
+                power_refit
+                if likelier < F_LEVEL and power_refit.mean() > power.mean()
+                else power
             )
     local = np.zeros((2, *grid.views.shape))
     i, j = _halves(coarse)

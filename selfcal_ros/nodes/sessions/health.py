@@ -192,9 +192,9 @@ class Losses(Tally):
         place = f"{topic}, not listening"
         self._tell(place, self.counts[place] + number, line, line)
 
-    def _tell(self, place: str, total: int, said: str, line: str) -> None:
+    def _tell(self, place: str, total: int, warning: str, line: str) -> None:
         if not self._is_recent(place):
-            self._say(Level.WARN, said)
+            self._say(Level.WARN, warning)
         self.counts[place] = total
         self._last[place] = (self._now_s(), line)
 

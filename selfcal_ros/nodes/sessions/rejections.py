@@ -74,7 +74,7 @@ class RejectionWatch:
         where.update(
             (index, f"view '{view.view.name}': ") for index, view in progress.items()
         )
-        found: dict[Key, str] = {
+        line_of_finding: dict[Key, str] = {
             (index, finding.reason): f"{where[index]}{finding}"
             for index, finding in findings.items()
         }
@@ -82,12 +82,13 @@ class RejectionWatch:
             finding = of_last(index, rejected)
             if (
                 finding
-                and not {(index, finding.reason), (None, finding.reason)} & found.keys()
+                and not {(index, finding.reason), (None, finding.reason)}
+                & line_of_finding.keys()
             ):
-                found[index, finding.reason] = (
+                line_of_finding[index, finding.reason] = (
                     f"{where[index]}none of the last ones was used: {finding}"
                 )
-        reported = found.keys() | self._said
+        reported = line_of_finding.keys() | self._said
         advised: dict[Key, str] = {
             (index, reason): where[index] + line
             for index in ended
@@ -96,7 +97,7 @@ class RejectionWatch:
             for line in advice({reason: count})
         }
         now = float("-inf") if final else self._now_s()
-        self._found = _since(now, self._found, found)
+        self._found = _since(now, self._found, line_of_finding)
         self._advised = _since(now, self._advised, advised)
         self.tell()
 

@@ -268,8 +268,12 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     place = cells[:2] * MM_PER_M
     error = cells[2:4]
     u = cells[4:6] * result.noise.k_xy
-    apart = abs(place[0] + 1j * place[1] - (place[0] + 1j * place[1])[:, None])
-    spacing = float(apart[apart > 0].min(initial=np.inf)) if len(apart) > 1 else 1.0
+    distance_mm = abs(place[0] + 1j * place[1] - (place[0] + 1j * place[1])[:, None])
+    spacing = (
+        float(distance_mm[distance_mm > 0].min(initial=np.inf))
+        if len(distance_mm) > 1
+        else 1.0
+    )
     factor = parts.enlargement(np.hypot(*error), spacing / MM_PER_M)
     reach = float(
         np.abs(np.concatenate([place, place + error * factor * MM_PER_M])).max()
