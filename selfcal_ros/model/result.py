@@ -16,6 +16,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import BudgetLine, budget_from_list, line_to_dict
 from selfcal_ros.model.camera import (
     CameraErrors,
     StageYawMap,
@@ -45,13 +46,10 @@ from selfcal_ros.model.reference import (
     reference_to_dict,
 )
 from selfcal_ros.model.verdict import (
-    BudgetLine,
     Grade,
     ModelResult,
     Provenance,
     Verdict,
-    budget_from_list,
-    line_to_dict,
     provenance_from_dict,
     verdict_from_dict,
     verdict_to_dict,

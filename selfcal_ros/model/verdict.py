@@ -74,47 +74,6 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class BudgetLine:
-    """A line of the uncertainty budget of a map (GUM), SI units.
-
-    Attributes
-    ----------
-    quantity : str
-        ``xy``, one coordinate of the XY map, m; or ``theta``, the angular map, rad.
-    component : str
-        Source of the uncertainty.
-    kind : str
-        ``A`` (statistics of readings) or ``B`` (other knowledge), GUM 4.2 and 4.3.
-    value, u, unit : float, float, str
-        Estimate of the input quantity and its standard uncertainty; of a term its largest
-        coefficient. NaN where it is not known.
-    effect_rms, effect_max : float
-        Standard uncertainty of the map from it, over the field and at its worst node or line.
-    dof : float
-        Degrees of freedom; infinite if known.
-    source : str
-        What gives `u`: ``readings``, or what was ``declared`` or is assumed by ``default``.
-    details : dict
-        How it was found, by name.
-    text : str
-        The same in words; empty before it is worded.
-    """
-
-    quantity: str
-    component: str
-    kind: str
-    value: float
-    u: float
-    unit: str
-    effect_rms: float
-    effect_max: float
-    dof: float
-    source: str
-    details: dict[str, Any] = field(default_factory=dict)
-    text: str = ""
-
-
-@dataclass(frozen=True)
 class TermEstimate:
     """One coefficient of a term: SI unit, standard uncertainty (k=1).
 
@@ -224,28 +183,6 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
         enlarged_by=read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
         sentence=read(str, data["sentence"]),
         reasons=read(tuple[str, ...], data["reasons"]),
-    )
-
-
-def line_to_dict(line: BudgetLine) -> dict[str, Any]:
-    """Return the JSON form of a line of the budget."""
-    return {
-        "type" if name == "kind" else name: value for name, value in vars(line).items()
-    }
-
-
-def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
-    """Return the lines of a budget."""
-    return tuple(
-        read(
-            BudgetLine,
-            row
-            | {
-                "dof": math.inf if row["dof"] is None else row["dof"],
-                "kind": row["type"],
-            },
-        )
-        for row in (read(dict, line) for line in read(list, rows))
     )
 
 

@@ -3,6 +3,7 @@
 
 import copy
 import json
+import math
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -11,6 +12,16 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import (
+    BudgetLine,
+    OfAssumption,
+    OfCause,
+    OfNoise,
+    OfPlate,
+    OfReference,
+    OfRuns,
+    OfTerm,
+)
 from selfcal_ros.model.findings import (
     Cause,
     FewRead,
@@ -450,3 +461,38 @@ def test_a_file_of_a_version_without_digests_is_not_qualified(older, tmp_path):
 )
 def test_a_reference_is_named_by_its_kind_or_its_marks(kind, marks, name):
     assert ReferenceLength(kind, 1e-6, marks=marks).name == name
+
+
+@pytest.mark.parametrize(
+    "details",
+    [
+        OfNoise("repeats", contradicted=True),
+        OfTerm(given=1e-8, allowed=None, remaining=0.4),
+        OfTerm(given=1e-8, allowed=2e-8, remaining=0.4),
+        OfAssumption(1e-8),
+        OfCause("drift"),
+        OfRuns(3),
+        OfReference("stage_x"),
+        OfPlate("old.json"),
+        {},
+        {"of_a_later_version": [1.0]},
+        {"runs": "three"},
+    ],
+    ids=str,
+)
+def test_how_a_line_of_the_budget_was_found_comes_back(details):
+    line = BudgetLine(
+        quantity="xy",
+        component="reading noise",
+        kind="A",
+        value=0.0,
+        u=2e-8,
+        unit="m",
+        effect_rms=1e-8,
+        effect_max=3e-8,
+        dof=math.inf,
+        source="readings",
+        details=details,
+    )
+    result = replace(known_result()[0], budget=(line,))
+    assert through_json(result).budget == (line,)

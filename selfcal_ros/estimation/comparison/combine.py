@@ -41,6 +41,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     remaining_part,
 )
+from selfcal_ros.model.budget import BudgetLine, OfRuns
 from selfcal_ros.model.error_map import (
     MANY_DOF,
     ErrorMap,
@@ -60,7 +61,6 @@ from selfcal_ros.model.result import (
     Observability,
 )
 from selfcal_ros.model.verdict import (
-    BudgetLine,
     Enlargement,
     Grade,
     ModelResult,
@@ -1087,7 +1087,7 @@ def _budget(
                     effect_max=float(u.max()),
                     dof=dof,
                     source="readings",
-                    details={"runs": len(mean.weights)},
+                    details=OfRuns(len(mean.weights)),
                 )
             )
         lines += [line for line in between if line.quantity == kind]

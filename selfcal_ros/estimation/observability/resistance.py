@@ -47,10 +47,10 @@ from selfcal_ros.estimation.terms.planned import (
     rows_of,
     with_terms,
 )
+from selfcal_ros.model.budget import BudgetLine
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import TIMES, UNDETERMINED, ModelTerm, nominal_terms
-from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 
 DRAWS = 20_000

@@ -72,6 +72,7 @@ from selfcal_ros.estimation.terms.visits import term_inputs, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import BudgetLine, Details, OfNoise, OfPlate
 from selfcal_ros.model.error_map import (
     ErrorMap,
     ThetaDatum,
@@ -93,7 +94,6 @@ from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
 from selfcal_ros.model.verdict import (
-    BudgetLine,
     Grade,
     ModelResult,
     TermResult,
@@ -839,9 +839,9 @@ def _budget(
             continue
         kind, u, unit, dof, source = rows[name]
         u_map = np.sqrt(variance)
-        details: dict[str, object] = {"plate": plate.where}
+        details: Details = OfPlate(plate.where)
         if name == NOISE:
-            details = {"by": by, "contradicted": False}
+            details = OfNoise(by, contradicted=False)
         yield BudgetLine(
             quantity="xy",
             component=name,

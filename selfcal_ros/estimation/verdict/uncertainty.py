@@ -16,13 +16,21 @@ from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solve import factors_of, variance_of_terms
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.options import OWED
+from selfcal_ros.model.budget import (
+    BudgetLine,
+    OfAssumption,
+    OfCause,
+    OfNoise,
+    OfReference,
+    OfTerm,
+)
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.kept import rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
-from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
+from selfcal_ros.model.verdict import Enlargement, TermResult
 
 DETERMINED_BELOW = 0.5
 """Share of a term's size left by the readings below which they determine the term (type A)."""
@@ -419,7 +427,7 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
         effect_max=float(np.nanmax(u)),
         dof=dof,
         source="declared" if by == "declared" else "readings",
-        details={"by": by, "contradicted": bool(p < F_LEVEL)},
+        details=OfNoise(by, contradicted=bool(p < F_LEVEL)),
     )
 
 
@@ -430,7 +438,7 @@ def _term_line(
 
     A term is of type A if the readings determine it, otherwise of type B.
     """
-    effect = rms(u), float(u.max(initial=0.0))
+    effect_rms, effect_max = rms(u), float(u.max(initial=0.0))
     term = next((term for term in result.model.terms if term.name == name), None)
     if term is None:
         cause = next(
@@ -439,16 +447,17 @@ def _term_line(
         if cause is None and name in blocks():  # not determined by the readings
             block = block_of(name)
             return BudgetLine(
-                quantity,
-                TERM + name,
-                "B",
-                np.nan,
-                block.nominal,
-                block.unit,
-                *effect,
-                np.inf,
-                "default",
-                {"given": block.nominal},
+                quantity=quantity,
+                component=TERM + name,
+                kind="B",
+                value=np.nan,
+                u=block.nominal,
+                unit=block.unit,
+                effect_rms=effect_rms,
+                effect_max=effect_max,
+                dof=np.inf,
+                source="default",
+                details=OfAssumption(block.nominal),
             )
         value, u_value, unit = (
             (np.nan, np.nan, "m")
@@ -456,16 +465,17 @@ def _term_line(
             else (cause.size, cause.u, cause.unit)
         )
         return BudgetLine(
-            quantity,
-            f"effect {name}",
-            "B",
-            value,
-            u_value,
-            unit,
-            *effect,
-            np.inf,
-            "readings",
-            {"cause": name},
+            quantity=quantity,
+            component=f"effect {name}",
+            kind="B",
+            value=value,
+            u=u_value,
+            unit=unit,
+            effect_rms=effect_rms,
+            effect_max=effect_max,
+            dof=np.inf,
+            source="readings",
+            details=OfCause(name),
         )
     remaining = remaining_part(term)
     determined = remaining < DETERMINED_BELOW
@@ -478,21 +488,23 @@ def _term_line(
     largest = max(
         term.estimates, key=lambda estimate: abs(np.nan_to_num(estimate.value))
     )
+    by_readings = determined or term.size_used or by_images
     return BudgetLine(
-        quantity,
-        TERM + name,
-        "A" if determined else "B",
-        largest.value,
-        largest.u,
-        largest.unit,
-        *effect,
-        _dof(result.noise, quantity) if determined else np.inf,
-        "readings" if determined or term.size_used or by_images else term.source,
-        {
-            "given": term.size or term.solved_with,
-            "allowed": term.size_used,
-            "remaining": remaining,
-        },
+        quantity=quantity,
+        component=TERM + name,
+        kind="A" if determined else "B",
+        value=largest.value,
+        u=largest.u,
+        unit=largest.unit,
+        effect_rms=effect_rms,
+        effect_max=effect_max,
+        dof=_dof(result.noise, quantity) if determined else np.inf,
+        source="readings" if by_readings else term.source,
+        details=OfTerm(
+            given=term.size or term.solved_with,
+            allowed=term.size_used,
+            remaining=remaining,
+        ),
     )
 
 
@@ -521,7 +533,7 @@ def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetL
         effect_max=float(u.max()),
         dof=np.inf,
         source="declared",
-        details={"kind": str(reference.kind)},
+        details=OfReference(str(reference.kind)),
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
+from selfcal_ros.model.budget import BudgetLine, OfAssumption, OfTerm
 from selfcal_ros.model.findings import (
     AxesNotMet,
     BetweenRuns,
@@ -53,7 +54,7 @@ from selfcal_ros.model.findings import (
 )
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
-from selfcal_ros.model.verdict import BudgetLine, Grade, Verdict
+from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -685,8 +686,8 @@ def assumption_text(result: CalibrationResult) -> str:
 def _assumed(line: BudgetLine) -> str:
     name = line.component.removeprefix(TERM)
     unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, line.unit)
-    stated_si = line.details.get("given")  # a file may have lost it
-    size_si = stated_si if isinstance(stated_si, float) else line.u
+    of = line.details
+    size_si = of.given if isinstance(of, OfTerm | OfAssumption) else line.u
     size = f"{size_si * unit.per_si:.3g} {unit.name} (k=1)"
     return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 

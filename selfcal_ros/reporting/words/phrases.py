@@ -8,6 +8,16 @@ from typing import Any
 
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.model.budget import (
+    BudgetLine,
+    OfAssumption,
+    OfCause,
+    OfNoise,
+    OfPlate,
+    OfReference,
+    OfRuns,
+    OfTerm,
+)
 from selfcal_ros.model.findings import (
     Changed,
     ChangedOrDrifted,
@@ -25,7 +35,6 @@ from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
-from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {
@@ -143,35 +152,35 @@ def of_few_read(findings: Sequence[Finding]) -> str:
 
 def line_text(line: BudgetLine) -> str:
     """Return how a line of the budget was found."""
-    of = line.details
-    if "by" in of:
-        return _NOISES[of["by"]] + (
-            ", the larger of two that contradict each other (see the verdict)"
-            if of["contradicted"]
-            else ""
-        )
-    if "given" in of and "remaining" not in of:
-        return f"size {of['given']:.3g}, what the readings do not determine of it"
-    if "given" in of:
-        size_text = f"size {of['given']:.3g}, " + (
-            "of which the readings"
-            if of["allowed"] is None
-            else f"too small for the readings; of {of['allowed']:.3g}, which they allow, they"
-        )
-        return f"{size_text} leave {of['remaining']:.0%}"
-    if of.get("cause") == LACK_OF_FIT:
-        return "residuals beyond the scatter of repeats, met in full at every place"
-    if "cause" in of:
-        return f"effect of the cause '{of['cause']}' that the readings show (see the verdict)"
-    if "runs" in of:
-        return {
-            "between runs": f"scatter of {of['runs']} runs beyond their uncertainties",
-            "shared by all runs": "declared or assumed, the same in all runs",
-        }.get(line.component, f"uncertainties of {of['runs']} runs, by their weights")
-    if "kind" in of:
-        return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
-    if "plate" in of:
-        return OF_RECHECK[line.component].format(of["plate"])
+    match line.details:
+        case OfNoise(by, contradicted):
+            return _NOISES[by] + (
+                ", the larger of two that contradict each other (see the verdict)"
+                if contradicted
+                else ""
+            )
+        case OfAssumption(given):
+            return f"size {given:.3g}, what the readings do not determine of it"
+        case OfTerm(given, allowed, remaining):
+            but = (
+                "of which the readings"
+                if allowed is None
+                else f"too small for the readings; of {allowed:.3g}, which they allow, they"
+            )
+            return f"size {given:.3g}, {but} leave {remaining:.0%}"
+        case OfCause(cause) if cause == LACK_OF_FIT:
+            return "residuals beyond the scatter of repeats, met in full at every place"
+        case OfCause(cause):
+            return f"effect of the cause '{cause}' that the readings show (see the verdict)"
+        case OfRuns(runs):
+            return {
+                "between runs": f"scatter of {runs} runs beyond their uncertainties",
+                "shared by all runs": "declared or assumed, the same in all runs",
+            }.get(line.component, f"uncertainties of {runs} runs, by their weights")
+        case OfReference(kind):
+            return f"relative {line.u:.3g} of the distance from the centre, by {kind}"
+        case OfPlate(plate):
+            return OF_RECHECK[line.component].format(plate)
     if line.component == INTERPOLATION:
         nodes = "sites" if line.quantity == "xy" else "lines"
         return f"curvature of the map; assumes that it is smooth between {nodes}"

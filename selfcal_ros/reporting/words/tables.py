@@ -11,9 +11,9 @@ from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import BudgetLine
 from selfcal_ros.model.findings import Finding, RestNotIdentified
 from selfcal_ros.model.terms import TIMES
-from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
 from selfcal_ros.reporting.words.observability import describe_view

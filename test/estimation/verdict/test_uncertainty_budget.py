@@ -13,6 +13,7 @@ from selfcal_ros.estimation.comparison.covariance import covariance_of, first_or
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.budget import OfNoise
 from selfcal_ros.model.error_map import first_order
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceLength
@@ -57,7 +58,7 @@ def drawn_up(result, **changed):
 
 
 def by(noise, *, contradicted=False):
-    return {"by": noise, "contradicted": contradicted}
+    return OfNoise(noise, contradicted=contradicted)
 
 
 def test_reading_noise_is_that_of_the_map():
@@ -316,7 +317,7 @@ def test_a_line_says_what_its_size_rests_on(given, source):
     line = parts_of(budgets(result)[0])["term plate_strain"]
     (term,) = (term for term in result.model.terms if term.name == "plate_strain")
     assert (line.kind, line.source, line.unit, line.dof) == ("B", source, "m/m", np.inf)
-    assert line.details["given"] == term.size and line.details["remaining"] > 0.5
+    assert line.details.given == term.size and line.details.remaining > 0.5
     largest = max(term.estimates, key=lambda estimate: abs(estimate.value))
     assert (line.value, line.u) == (largest.value, largest.u)
 
