@@ -343,10 +343,8 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
             f"not JSON ({error.msg})",
             "give a file that `selfcal` wrote",
         ) from error
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # a number too long, brackets too deep
+    except (ValueError, RecursionError) as error:
+        # a number too long, brackets too deep
         raise InputError(
             str(path),
             f"not usable JSON ({first_line(error)})",

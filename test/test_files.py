@@ -338,10 +338,7 @@ def test_faults_in_json(tmp_path, text, message):
         ),
         ("!!bool perhaps", ":1:1: not YAML (not a value of the type bool)"),
         ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
-        (
-            "a: 2001-13-40",
-            ":1:4: not YAML (month must be in 1..12); correct the line",
-        ),
+        ("a: 2001-13-40", ":1:4: not YAML (month must be in 1..12); correct the line"),
         ("[" * 2_000, ": not usable YAML (maximum recursion depth"),
     ],
 )

@@ -252,12 +252,10 @@ class Journal(Closing):
             self._declare(topic, bag_topic)
         metadata.write(path)
         self._stop = threading.Event()
-        self._unsynced_s: float | None = (
-            None  # time since which there is something to synchronise
-        )
-        self._syncing_s: float | None = (
-            None  # the same for the synchronisation in progress
-        )
+        # time since which there is something to synchronise
+        self._unsynced_s: float | None = None
+        # the same for the synchronisation in progress
+        self._syncing_s: float | None = None
         self._syncer = threading.Thread(
             target=self._sync_on, name="journal", daemon=True
         )
@@ -361,9 +359,8 @@ class Journal(Closing):
                 self._syncing_s, self._unsynced_s = since, None
                 try:
                     self._file.sync()
-                except (
-                    OSError
-                ) as error:  # it may be dropped, and later syncs do not report it
+                except OSError as error:
+                    # it may be dropped, and later syncs do not report it
                     self._failed, self._unsynced_s = error, since
                     self._n_unsynced += n_appended - self._n_synced
                 self._n_synced = n_appended

@@ -357,9 +357,8 @@ def read_summary(file: BinaryIO) -> Summary:
     """
     try:
         summary = _parsed(_content(file))
-    except (
-        Exception
-    ):  # a damaged summary may fail anywhere in its parser: read everything
+    except Exception:
+        # a damaged summary may fail anywhere in its parser: read everything
         return Summary()
     return summary if summary.complete else Summary()
 

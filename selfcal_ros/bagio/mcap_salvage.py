@@ -317,9 +317,8 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
             return
         try:
             record, _ = parsed(opcode, body[offset : offset + length])
-        except (
-            Exception
-        ):  # a damaged chunk, not only truncated: the rest cannot be trusted
+        except Exception:
+            # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
             yield record

@@ -201,9 +201,8 @@ class McapStream:
                 continue
             try:
                 opcode, record, end = _record(file, offset, size)
-            except (
-                Exception
-            ) as error:  # a damaged record may fail anywhere in its parser
+            except Exception as error:
+                # a damaged record may fail anywhere in its parser
                 size = self._end_at_joint(file, last, size)
                 # the one before is cut off
                 offset, sure = (offset, sure) if offset <= size else (last, last)
@@ -252,10 +251,7 @@ class McapStream:
         return self._size
 
     def _chunk(
-        self,
-        file: BinaryIO,
-        chunk: Chunk,
-        place: tuple[int, int],
+        self, file: BinaryIO, chunk: Chunk, place: tuple[int, int]
     ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the messages of a chunk between two bytes of the file."""
         start, position = place

@@ -266,8 +266,7 @@ class BagReader:
             raise refused[0]
 
     def _blocks(
-        self,
-        bad: Counter,
+        self, bad: Counter
     ) -> Iterator[tuple[MessageBlock, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
         watches = (

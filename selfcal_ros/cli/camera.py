@@ -148,8 +148,7 @@ def pose_text(camera: "CameraPose", output: str) -> str:
 
 
 def _of_bag(
-    args: argparse.Namespace,
-    detector: "ImageDetector",
+    args: argparse.Namespace, detector: "ImageDetector"
 ) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a bag."""
     stamps, track = encoder_track(args.bag)
@@ -183,8 +182,7 @@ def _of_bag(
 
 
 def _of_files(
-    args: argparse.Namespace,
-    detector: "ImageDetector",
+    args: argparse.Namespace, detector: "ImageDetector"
 ) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a folder."""
     positions, images = [], []

@@ -15,11 +15,7 @@ from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_setti
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import write_bytes
-from selfcal_ros.settings.detector import (
-    ANY_NUMBER,
-    OPTIONS,
-    DetectorSettings,
-)
+from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.vision.detector import Judged, Mark
 from selfcal_ros.vision.drawing import circled

@@ -41,12 +41,7 @@ from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
-from selfcal_ros.outputs import (
-    check_outputs,
-    refuse_existing,
-    utf8,
-    write_together,
-)
+from selfcal_ros.outputs import check_outputs, refuse_existing, utf8, write_together
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.observability import (
     describe_view,

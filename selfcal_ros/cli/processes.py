@@ -66,10 +66,7 @@ def ros_arguments(args: argparse.Namespace) -> list[str]:
 
 @contextlib.contextmanager
 def process(
-    module: str,
-    arguments: list[str],
-    environment: dict,
-    **kwargs: Any,
+    module: str, arguments: list[str], environment: dict, **kwargs: Any
 ) -> Iterator[subprocess.Popen]:
     """Run a module as a process that is stopped, at worst killed, at the end of the block.
 

@@ -41,11 +41,7 @@ from selfcal_ros.files import read_json, write_yaml
 from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 from selfcal_ros.portable import ended_by_signals
-from selfcal_ros.settings.detector import (
-    ANY_NUMBER,
-    OPTIONS,
-    DetectorSettings,
-)
+from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import INPUT_TOPICS, LARGEST_DOMAIN
 
@@ -321,13 +317,7 @@ def _play(
         session = stack.enter_context(
             process(
                 "selfcal_ros.nodes.replay_session",
-                [
-                    args.bag,
-                    str(rate),
-                    str(saved),
-                    cell,
-                    *quiet,
-                ],
+                [args.bag, str(rate), str(saved), cell, *quiet],
                 environment,
                 stdout=subprocess.PIPE,
                 text=True,

@@ -55,10 +55,7 @@ from selfcal_ros.reporting.words.tables import (
     validation_text,
 )
 from selfcal_ros.settings.estimator import solver_options
-from selfcal_ros.settings.nodes import (
-    CollectorSettings,
-    SolverSettings,
-)
+from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

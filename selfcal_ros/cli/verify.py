@@ -6,13 +6,7 @@ import sys
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.cli import solve
-from selfcal_ros.cli.terminal import (
-    busy,
-    progress_bar,
-    say,
-    say_unless_qualified,
-    tell,
-)
+from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.checks.placing import PlacingError

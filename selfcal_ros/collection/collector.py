@@ -20,11 +20,7 @@ from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.marks.stops import count_stops
 from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
-from selfcal_ros.collection.timeline import (
-    Timeline,
-    build_timeline,
-    without_strays,
-)
+from selfcal_ros.collection.timeline import Timeline, build_timeline, without_strays
 from selfcal_ros.collection.view_readings import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings

@@ -12,9 +12,7 @@ from itertools import product
 import numpy as np
 
 from selfcal_ros.collection.inputs import REMEDY, Reason
-from selfcal_ros.collection.marks.seen_poses import (
-    NamedMarks,
-)
+from selfcal_ros.collection.marks.seen_poses import NamedMarks
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.units import NS_PER_S
 

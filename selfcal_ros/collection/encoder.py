@@ -122,9 +122,7 @@ class JointSamples:
         return len(self.t)
 
     def decided_by(
-        self,
-        stamps_ns: np.ndarray,
-        since_ns: np.ndarray | None = None,
+        self, stamps_ns: np.ndarray, since_ns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the first and last stamps on which the result for each exposure depends.
 
@@ -211,11 +209,7 @@ class JointSamples:
         return fast
 
     def approach(
-        self,
-        stamps_ns: np.ndarray,
-        positions: np.ndarray,
-        *,
-        threshold: float,
+        self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float
     ) -> np.ndarray:
         """Return the sign of the last motion before each exposure, int8 array (Q,).
 
@@ -334,10 +328,7 @@ class JointSamples:
         return before, after, exact, outside
 
     def _motion(
-        self,
-        before: np.ndarray,
-        after: np.ndarray,
-        exact: np.ndarray,
+        self, before: np.ndarray, after: np.ndarray, exact: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return for which exposures the stage moves, and for which it jumps back and forth."""
         v = self.v

@@ -109,9 +109,7 @@ class DetectionsSeen:
         )
 
     def findings(
-        self,
-        views: Mapping[int, ViewReadings],
-        loose: Mapping[str, int],
+        self, views: Mapping[int, ViewReadings], loose: Mapping[str, int]
     ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 

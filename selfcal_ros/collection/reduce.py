@@ -82,10 +82,7 @@ def canonical(detections: np.ndarray) -> np.ndarray:
 
 
 def clean(
-    detections: np.ndarray,
-    rules: Rules,
-    *,
-    scored: bool,
+    detections: np.ndarray, rules: Rules, *, scored: bool
 ) -> tuple[np.ndarray, np.ndarray, Counter]:
     """Return usable detections, those of a low score, and how many were rejected for what reason.
 

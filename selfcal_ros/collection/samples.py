@@ -128,9 +128,8 @@ class SampleStore:
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
-        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = (
-            None  # the last block read
-        )
+        # the last block read
+        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = None
         self.newest_ns, self.problem = int(np.iinfo(np.int64).min), ""
 
     def __len__(self) -> int:

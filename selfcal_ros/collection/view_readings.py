@@ -67,9 +67,7 @@ class ViewCache:
             self._changed.append(stamps_ns)
 
     def readings(
-        self,
-        timeline: Timeline,
-        exposures: Exposures,
+        self, timeline: Timeline, exposures: Exposures
     ) -> tuple[dict[int, ViewReadings], Counter]:
         """Return the readings of every view, and reason -> detections that belong to no view."""
         for index in self._assign(timeline):

@@ -167,10 +167,7 @@ class Cells:
         return out
 
     def solve_in_cell(
-        self,
-        s: np.ndarray,
-        t: np.ndarray,
-        scale: float,
+        self, s: np.ndarray, t: np.ndarray, scale: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the (a, b) with (a, b) + scale * fields(a, b) = (s, t), by fixed point.
 
@@ -221,10 +218,7 @@ class Cells:
         return math.nan, math.nan
 
     def solve(
-        self,
-        s: np.ndarray,
-        t: np.ndarray,
-        scale: float,
+        self, s: np.ndarray, t: np.ndarray, scale: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `solve_in_cell`, with the solution in any cell."""
         a, b = s, t
@@ -282,10 +276,7 @@ class Cells:
         return np.ascontiguousarray(rows) if often else rows
 
     def _polynomials(
-        self,
-        rows: np.ndarray,
-        u: np.ndarray,
-        v: np.ndarray,
+        self, rows: np.ndarray, u: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         side = self.degree + 1
         return (

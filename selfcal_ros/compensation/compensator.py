@@ -238,9 +238,7 @@ class Compensator:
         )
 
     def uncertainty_indicated(
-        self,
-        x_m: ArrayLike,
-        y_m: ArrayLike,
+        self, x_m: ArrayLike, y_m: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return `uncertainty` at the true positions of indicated ones `x_m`, `y_m`.
 
@@ -407,10 +405,7 @@ class Compensator:
         return field
 
     def _blocks(
-        self,
-        field: _Field,
-        position: tuple[ArrayLike, ArrayLike],
-        block: int,
+        self, field: _Field, position: tuple[ArrayLike, ArrayLike], block: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Apply `field` block by block to broadcast positions."""
         x, y = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in position))

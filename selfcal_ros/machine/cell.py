@@ -278,10 +278,7 @@ def _only(data: Mapping[str, Any], known_keys: Any, where: str) -> None:
 
 
 def _numbers(
-    data: Any,
-    where: str,
-    defaults: Mapping[str, float],
-    low: float | None = None,
+    data: Any, where: str, defaults: Mapping[str, float], low: float | None = None
 ) -> dict[str, float]:
     section = _mapping(data, where)
     _only(section, defaults, where)

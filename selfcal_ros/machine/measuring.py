@@ -40,11 +40,7 @@ from selfcal_ros.model.readings import (
 )
 from selfcal_ros.model.view import Plan
 from selfcal_ros.settings.nodes import CollectorSettings
-from selfcal_ros.topics import (
-    COMMAND_TOPIC,
-    INPUT_TOPICS,
-    qos_profile,
-)
+from selfcal_ros.topics import COMMAND_TOPIC, INPUT_TOPICS, qos_profile
 from selfcal_ros.units import NS_PER_S, UM_PER_M
 
 REVISITS = 3

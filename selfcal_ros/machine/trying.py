@@ -155,9 +155,7 @@ class Trial:
         return picture.values, marks
 
     def _sized(
-        self,
-        picture: Picture,
-        settings: DetectorSettings,
+        self, picture: Picture, settings: DetectorSettings
     ) -> tuple[float, list[tuple[float, float]]]:
         """Return the size of a mark, px, and the places of all, columns and rows."""
         known_size_px = self.mark_pixels or (

@@ -181,9 +181,8 @@ class Visitor:
         self._untold: list[EncoderSample] = []  # of moves
         self._has_moved = False
         self._told_ns = 0  # newest stamp of a position
-        self._asked: tuple[str, int] | None = (
-            None  # what the machine has to answer, and since when
-        )
+        # what the machine has to answer, and since when
+        self._asked: tuple[str, int] | None = None
         self.stopped = False
 
     def stop(self) -> None:
@@ -302,10 +301,7 @@ class Visitor:
             self.first_move(marks=True)
 
     def view(
-        self,
-        artifact: Artifact,
-        view: View,
-        again: Again | None = None,
+        self, artifact: Artifact, view: View, again: Again | None = None
     ) -> Iterator[Event]:
         """Visit a view and yield positions, and detections or images, in the order of their stamps.
 

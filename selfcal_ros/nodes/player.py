@@ -133,9 +133,10 @@ class Player:
 
     taken: int | None = None
     """Images that the detector has taken."""
-    found = matched = (
-        0  # detections that it has published, and subscribers matched to them
-    )
+    found = 0
+    """Detections that it has published."""
+    matched = 0
+    """Subscribers matched to them."""
     _taken_before = 0
 
     @property

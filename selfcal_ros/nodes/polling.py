@@ -58,9 +58,8 @@ class ByTheClock:
             int | None
         ] = []  # of messages taken since the last check for gaps
         self._last: int | None = None
-        self._before: int | None = (
-            None  # the last number of the subscription before this one
-        )
+        # the last number of the subscription before this one
+        self._before: int | None = None
         self._n_publishers = 0
 
     def __call__(self, *received: Any) -> None:

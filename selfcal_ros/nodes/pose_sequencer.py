@@ -41,9 +41,8 @@ class CalibrationAction:
         self._node = node
         self._session: SequencingSession | None = None
         self._saver: Any = None
-        self._taken = (
-            False  # from the acceptance of a goal, before it is executed, to its end
-        )
+        # from the acceptance of a goal, before it is executed, to its end
+        self._taken = False
         self._goal: Any = None
         self._feedback: Any = None  # of this goal, the last
         self._ended: Future | None = None
@@ -113,9 +112,8 @@ class CalibrationAction:
         self._taken = True
         try:
             goal.execute()
-        except (
-            Exception
-        ):  # counted where it is caught; the next goal is not rejected for it
+        except Exception:
+            # counted where it is caught; the next goal is not rejected for it
             self._taken = False
             raise
 

@@ -170,10 +170,7 @@ class StageSimulator(CellNode[SimulatorSettings]):
         now_ns = self.get_clock().now().nanoseconds
         while self._next is not None and self._next.stamp_ns <= now_ns:
             # whatever is raised now, it is told once
-            event, self._next = (
-                self._next,
-                None,
-            )
+            event, self._next = (self._next, None)
             self.tell(event)
             self._next, self._free_ns = next(self._events, None), now_ns
         if self._next is None and now_ns - self._time.ns >= IDLE_STEPS * self._step_ns:

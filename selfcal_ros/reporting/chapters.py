@@ -228,10 +228,7 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
         (
             *((_words(key), value) for key, value in about.items() if key not in ABOUT),
             *(
-                (
-                    _words(key),
-                    facts.get(key) or f"{UNKNOWN} (not given: {hint})",
-                )
+                (_words(key), facts.get(key) or f"{UNKNOWN} (not given: {hint})")
                 for key, hint in ABOUT.items()
             ),
             ("measured", measured if first else UNKNOWN),

@@ -144,9 +144,7 @@ def write_files(
 
 
 def image_fields(
-    exposure: Exposure,
-    camera: Camera,
-    rng: np.random.Generator,
+    exposure: Exposure, camera: Camera, rng: np.random.Generator
 ) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a rendered image."""
     values = camera.image(exposure.offsets, rng, angles=exposure.angle)

@@ -54,10 +54,7 @@ def plate_displacement(
 
 
 def marks_below(
-    truth: Truth,
-    index: int,
-    view: View,
-    marks: tuple[np.ndarray, np.ndarray],
+    truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marks found where `marks` would be if the plate were placed as commanded.
 
@@ -155,9 +152,7 @@ def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def _tilted(
-    tilt: np.ndarray,
-    arm: np.ndarray,
-    height: np.ndarray,
+    tilt: np.ndarray, arm: np.ndarray, height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacement of points (2, V) at heights (V,) along stage x, y, and upwards.
 
@@ -360,9 +355,7 @@ def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:
 
 
 def line_directions(
-    truth: Truth,
-    index: int,
-    view: View,
+    truth: Truth, index: int, view: View
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the true and the nominal direction in the stage frame of every line expected, rad.
 

@@ -77,9 +77,7 @@ class Faults:
 
 
 def apply_faults(
-    events: Sequence[Event | Exposure],
-    faults: Faults,
-    rng: np.random.Generator,
+    events: Sequence[Event | Exposure], faults: Faults, rng: np.random.Generator
 ) -> tuple[list[tuple[int, Event | Exposure]], dict[str, int]]:
     """Return (time of arrival in ns, message) in the order of arrival, and the ledger.
 
@@ -118,10 +116,7 @@ def apply_faults(
 
 
 def _spoil(
-    event: Event | Exposure,
-    faults: Faults,
-    rng: np.random.Generator,
-    ledger: Counter,
+    event: Event | Exposure, faults: Faults, rng: np.random.Generator, ledger: Counter
 ) -> Sequence[Event | Exposure]:
     if not isinstance(event, Detection | Exposure):
         return [event]

@@ -147,10 +147,7 @@ def camera_pose(
 
 
 def _similar(
-    by_stage: np.ndarray,
-    covariance: np.ndarray,
-    sense: Sense,
-    noise: float,
+    by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: float
 ) -> CameraPose:
     """Return the similarity in the change of places (px) by the stage (m), with uncertainties."""
     sign = 1 if sense is Sense.PLATE_MOVES else -1

@@ -383,10 +383,7 @@ def _without_doubles(
 
 
 def offset(
-    u: float,
-    v: float,
-    shape: tuple[int, ...],
-    settings: DetectorSettings,
+    u: float, v: float, shape: tuple[int, ...], settings: DetectorSettings
 ) -> tuple[float, float]:
     """Return the offset of a place in the image from the optical axis, stage axes, m.
 

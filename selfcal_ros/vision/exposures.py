@@ -103,9 +103,8 @@ class ImageDetector:
         self.counts = Counts()
         self.problems: Counter[str] = Counter()
         self.draw = draw
-        self._empty: Picture | None = (
-            None  # an image without marks, until there is a mark
-        )
+        # an image without marks, until there is a mark
+        self._empty: Picture | None = None
         self._source = _Source()
         self._stamps: dict[int, None] = {}  # of the images used, in their order
 
@@ -197,9 +196,7 @@ class ImageDetector:
         return detections
 
     def _identified(
-        self,
-        judged: list[Judged],
-        picture: Picture,
+        self, judged: list[Judged], picture: Picture
     ) -> tuple[list[Judged], list[tuple[int, int] | None]]:
         """Return the possible marks without parts of markers, and the ids of the marks."""
         if self._coded is None:

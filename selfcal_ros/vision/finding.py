@@ -64,11 +64,7 @@ class _Template:
 
 @lru_cache(maxsize=16)
 def _templates(
-    mark: str,
-    size: float,
-    width: float,
-    shape: tuple[int, int],
-    sign: int,
+    mark: str, size: float, width: float, shape: tuple[int, int], sign: int
 ) -> list[_Template]:
     """Return the templates over the turns of a mark.
 

@@ -192,10 +192,7 @@ def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit 
 
 
 def _image(
-    model: MarkModel,
-    u: np.ndarray,
-    v: np.ndarray,
-    p: np.ndarray,
+    model: MarkModel, u: np.ndarray, v: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return modelled images (marks, n), derivatives (marks, 6 + shape, n), shapes (marks, n).
 
@@ -260,9 +257,7 @@ def _solutions(solver: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.nda
 
 
 def _solved(
-    jacobian: np.ndarray,
-    residual: np.ndarray,
-    damping: np.ndarray,
+    jacobian: np.ndarray, residual: np.ndarray, damping: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the damped steps (marks, p), the normal matrices and the scales."""
     normal, scale = _normal(jacobian)
@@ -281,10 +276,7 @@ def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _unweighted_fits(
-    model: MarkModel,
-    windows: Windows,
-    starts: np.ndarray,
-    step: int,
+    model: MarkModel, windows: Windows, starts: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters of the unweighted fits, and which converged (Marquardt).
 

@@ -119,9 +119,7 @@ def _ring(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
 
 
 def _turned(
-    u: np.ndarray,
-    v: np.ndarray,
-    angle: Value,
+    u: np.ndarray, v: np.ndarray, angle: Value
 ) -> tuple[np.ndarray, np.ndarray, Value, Value]:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * u + sine * v, cosine * v - sine * u, cosine, sine

@@ -363,11 +363,7 @@ def test_records_between_messages_keep_their_place():
     assert kinds == [MessageBlock, Channel, MessageBlock, Schema]
     assert [
         m.data for m in flat(chunk_items(FakeChunk(data))) if isinstance(m, Message)
-    ] == [
-        b"a",
-        b"b",
-        b"c",
-    ]
+    ] == [b"a", b"b", b"c"]
 
 
 def test_runs_are_taken_at_once(monkeypatch):

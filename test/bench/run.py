@@ -64,12 +64,7 @@ def readings(size: int, missing: float = 0.0, noise_m: float = NOISE_M):
     import numpy as np
 
     from selfcal_ros.model.artifact import Artifact
-    from test.support.truth import (
-        Spread,
-        hu_plan,
-        random_truth,
-        simulate_measurements,
-    )
+    from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
     plan = hu_plan(Artifact(size, 0.01))
     rng = np.random.default_rng(size)

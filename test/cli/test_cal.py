@@ -477,10 +477,7 @@ def test_eval_refuses_a_length_of_an_axis_that_turns(run):
     counts = "--counts-per-unit", "3=1000"
     assert run("eval", "t.cal", "--position", "3=10", *counts)[0] == 0
     # told by where the table rolls over, or by its comments
-    for text in (
-        without_comments,
-        str,
-    ):
+    for text in (without_comments, str):
         code, out, err = run("eval", text("t.cal"), "--position", "3=10mm", *counts)
         assert (code, out) == (2, "")
         one_line(

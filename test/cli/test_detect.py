@@ -90,10 +90,7 @@ def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys
     }
     assert main(
         ["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]
-    ) in (
-        0,
-        5,
-    )
+    ) in (0, 5)
     result, truth = read_json(tmp_path / "R.json"), read_json(bag / "truth.json")
     emap = result["error_map"]
     for axis in ("gx", "gy"):
@@ -377,10 +374,7 @@ def test_the_times_of_files_are_those_of_the_table_and_unknown_without(files, tm
     )
     assert main(
         ["solve", str(tmp_path / "timed"), "-o", str(tmp_path / "R.json"), "--force"]
-    ) in (
-        0,
-        5,
-    )
+    ) in (0, 5)
     timed, plain = (read_json(each / "R.json") for each in (tmp_path, files))
     made = timed["provenance"]
     assert made["first_exposure"] == "2026-11-21T09:10:00.500+00:00"
@@ -590,10 +584,7 @@ def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
     )
     assert main(
         ["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]
-    ) in (
-        0,
-        5,
-    )
+    ) in (0, 5)
     result, truth = (
         read_json(tmp_path / "R.json"),
         read_json(tmp_path / "bag" / "truth.json"),

@@ -60,11 +60,7 @@ def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monke
     )
     assert [
         line for line in text if line in ("A", "B, in the datum of A", "B − A")
-    ] == [
-        "A",
-        "B, in the datum of A",
-        "B − A",
-    ]
+    ] == ["A", "B, in the datum of A", "B − A"]
     assert "B − A in θ in arcsec, outwards = counter-clockwise" in text
     a, b = (result_from_dict(read_json(file), file) for file in files)
     found = compare(a, b)

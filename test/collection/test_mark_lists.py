@@ -298,10 +298,7 @@ def test_the_plate_of_a_command_comes_back():
     command = Command(5, Phase.MEASURE, "p", 0, replace(VIEW, angular=False), plate, 1)
     fields = from_model.command(command, "stage")
     # old software refuses it
-    assert (fields["grid_size"], fields["grid_pitch"]) == (
-        0,
-        0.0,
-    )
+    assert (fields["grid_size"], fields["grid_pitch"]) == (0, 0.0)
     assert to_model.command(through_cdr("ViewCommand", fields)).artifact == plate
     for names, said in ((("mark_y",), "ids, "), (("map_grid_size",), "without nodes")):
         damaged = fields | {

@@ -418,10 +418,7 @@ def test_the_axes_fix_the_constant_of_a_series_too():
         ),
     )
     # known between the lines, or not
-    for one, positive in (
-        (result, False),
-        (at_lines, True),
-    ):
+    for one, positive in ((result, False), (at_lines, True)):
         between = next(
             line
             for line in budget_lines(one)

@@ -107,11 +107,7 @@ def parameters_of(description, **given: str) -> list[dict]:
     from launch_ros.utilities import evaluate_parameters
 
     # other with a cell
-    once = {
-        "measurement_collector",
-        "pose_sequencer",
-        "cell_driver",
-    }
+    once = {"measurement_collector", "pose_sequencer", "cell_driver"}
     found = []
     for path in FILES:
         context = LaunchContext()

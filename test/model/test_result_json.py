@@ -142,12 +142,7 @@ def test_an_unidentified_plan_has_maps_of_nulls():
         unidentified_result(
             measured,
             Observability(
-                25,
-                39,
-                14,
-                False,
-                (InWords(text="m"),),
-                (InWords(text="add tx"),),
+                25, 39, 14, False, (InWords(text="m"),), (InWords(text="add tx"),)
             ),
         )
     )

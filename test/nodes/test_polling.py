@@ -63,10 +63,7 @@ def test_numbers_of_several_publishers_tell_nothing_until_the_last_of_them_is_ta
     assert missing(callback, queue, 100_000, 3, 100_001, 4) == (0, 0)
     queue.n_publishers = 1
     # what came before the other left
-    assert missing(callback, queue, 5, 100_005) == (
-        0,
-        0,
-    )
+    assert missing(callback, queue, 5, 100_005) == (0, 0)
     assert missing(callback, queue, 6, 9) == (2, 0)
     queue.n_publishers = 2
     assert missing(callback, queue, 10, 1, 11) == (0, 0)

@@ -254,10 +254,7 @@ def test_a_recorder_whose_disk_is_full_ends_with_code_2(graph, group, tmp_path):
 @pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
 def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
     # and the session: a first and a last child
-    bag, nodes = (
-        small_bag(tmp_path),
-        NODES[1:2],
-    )
+    bag, nodes = (small_bag(tmp_path), NODES[1:2])
     some = f"from selfcal_ros.cli import replay; replay.NODES = {nodes}; "
     replay = group.start(
         "-c",

@@ -282,10 +282,7 @@ def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     given = up_verb.commands(args)["solver"]
     assert given[:3] == ["--ros-args", "-p", f"save_path:={tmp_path}/p_{{run_id}}.json"]
     # the later one counts
-    assert given[3:5] == [
-        "--params-file",
-        str(tmp_path / "cell.yaml"),
-    ]
+    assert given[3:5] == ["--params-file", str(tmp_path / "cell.yaml")]
     assert given[-2:] == ["-p", f"result_folder:={tmp_path}"]
 
 

@@ -10,11 +10,7 @@ import pytest
 from selfcal_ros import __version__
 from selfcal_ros.files import read_json, read_yaml
 from selfcal_ros.model.plan_form import plan_from_dict
-from selfcal_ros.settings.nodes import (
-    NODE_PARAMETERS,
-    NODE_SETTINGS,
-    overrides_in,
-)
+from selfcal_ros.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
 from selfcal_ros.simulation.spec import read_simulation
 
 ROOT = Path(__file__).parents[2]

@@ -81,11 +81,7 @@ def test_every_replaced_pin_is_one_of_the_environment():
         if "==" in line
     }
     # needed by the old versions alone
-    assert set(pins()) - own == {
-        "attrs",
-        "six",
-        "wheel",
-    }
+    assert set(pins()) - own == {"attrs", "six", "wheel"}
 
 
 @pytest.mark.parametrize("library", TOO_NEW)

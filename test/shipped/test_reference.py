@@ -8,11 +8,7 @@ import pytest
 import yaml
 
 from selfcal_ros import __version__
-from selfcal_ros.settings.nodes import (
-    NODE_PARAMETERS,
-    NODE_SETTINGS,
-    overrides_in,
-)
+from selfcal_ros.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
 
 ROOT = Path(__file__).parents[2]
 

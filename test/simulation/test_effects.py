@@ -132,10 +132,7 @@ def test_a_stage_bends_where_it_stands_whatever_lies_on_it():
     # x: 1 u^2 + 2 uv + 4 v^2, y: 8 u^2 + 16 uv + 32 v^2, in um at the edge
     truth = truth_with(stage_bend_m=np.array([[[1, 2, 4], [8, 16, 32]]]) * UM)
     # both on site (1, -1)
-    for view, mark in (
-        (View("v"), (1, -1)),
-        (QUARTER, (-1, -1)),
-    ):
+    for view, mark in ((View("v"), (1, -1)), (QUARTER, (-1, -1))):
         assert deviation(measured(truth, view=view), *mark) == pytest.approx(
             [3 * UM, 24 * UM]
         )

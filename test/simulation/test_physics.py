@@ -195,10 +195,7 @@ def test_what_is_read_by_a_perfect_cell_is_the_plain_deviation(sense):
 def test_between_sites_the_stage_error_is_bilinear_and_goes_on_straight_outside():
     g = np.zeros((2, 3, 3))
     # sites (0, 0), (0, 1); (1, 0), (1, 1)
-    g[0, 1:, 1:] = [
-        [1 * UM, 3 * UM],
-        [5 * UM, 11 * UM],
-    ]
+    g[0, 1:, 1:] = [[1 * UM, 3 * UM], [5 * UM, 11 * UM]]
     truth = truth_with(g=g)
     places = np.array([[0.0, 0.1, 0.05, 0.025, 0.12], [0.0, 0.1, 0.0, 0.05, 0.0]])
     # 0.12 is a fifth of a pitch beyond (1, 0): 5 + 0.2 (5 - 1)

@@ -121,12 +121,7 @@ def test_every_key_reaches_its_place(tmp_path):
         cell.encoder_rate_hz,
         cell.with_ids,
         cell.exposure_period_s,
-    ) == (
-        Sense.PLATE_MOVES,
-        1000,
-        False,
-        0.02,
-    )
+    ) == (Sense.PLATE_MOVES, 1000, False, 0.02)
     assert (cell.sigma_xy_m, cell.sigma_theta_rad, cell.declare_sigma) == (
         1e-8,
         2e-6,
@@ -137,12 +132,7 @@ def test_every_key_reaches_its_place(tmp_path):
         cell.stop_sigma_m,
         cell.stop_sigma_theta_rad,
         cell.follow_mark,
-    ) == (
-        0.0,
-        5e-5,
-        1e-5,
-        True,
-    )
+    ) == (0.0, 5e-5, 1e-5, True)
     assert (cell.visit_order, cell.consecutive) == ("random@plate", True)
     assert (cell.visit_xy_m, cell.flicker_xy_m, cell.flicker_theta_rad) == (
         1e-9,

@@ -273,11 +273,7 @@ def one_round(
 
 
 def full_disk(
-    seed: int,
-    environment: dict,
-    folder: Path,
-    *,
-    forks: Forks | None = None,
+    seed: int, environment: dict, folder: Path, *, forks: Forks | None = None
 ) -> tuple[str, list[str]]:
     """Measure in a cell whose disk is full for a third of the run; return a line, what was wrong.
 
@@ -449,11 +445,7 @@ BOMB_SIDE = 8000
 
 
 def attacked(
-    seed: int,
-    environment: dict,
-    folder: Path,
-    *,
-    forks: Forks | None = None,
+    seed: int, environment: dict, folder: Path, *, forks: Forks | None = None
 ) -> tuple[str, list[str]]:
     """Measure in a cell among strangers whose messages and files would harm.
 

@@ -127,8 +127,7 @@ def _alike(event: Event) -> tuple:
 
 
 def collect(
-    events: Iterable[Event],
-    **parameters: Any,
+    events: Iterable[Event], **parameters: Any
 ) -> tuple[Measurements, dict[int, ViewProgress]]:
     """Return the readings of all events."""
     return gathered(events, **parameters).collect()

@@ -103,11 +103,7 @@ class DenseFit:
         for number in range(self.steps):
             self._columns = self._of_coefficients()
             # between them the slopes hardly change
-            if number in (
-                0,
-                1,
-                self.steps - 1,
-            ):
+            if number in (0, 1, self.steps - 1):
                 self._linearise()
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)

@@ -40,9 +40,8 @@ class IndependentCell(Bench, Node):
         Node.__init__(self, "independent_cell", **kwargs)
         Bench.__init__(self, ids=ids, plate_moves=plate_moves, size=size, seed=seed)
         self.joints = joints
-        self.hold_at: tuple[int, int] | None = (
-            None  # view, and exposures after which it waits
-        )
+        # view, and exposures after which it waits
+        self.hold_at: tuple[int, int] | None = None
         self.exposed, self.view = 0, 0
         self._work: list = []
         self._acted = self._idle = 0

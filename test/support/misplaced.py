@@ -28,11 +28,7 @@ def laid(
 
 
 def laid_at(
-    artifact: Artifact,
-    index: int,
-    pose: tuple,
-    seed: int,
-    sigma: float = 20e-9,
+    artifact: Artifact, index: int, pose: tuple, seed: int, sigma: float = 20e-9
 ) -> Measurements:
     """Return readings of six views, one at another pose: its marks are taken for those planned."""
     lies = [*placed.SIX[:index], pose, *placed.SIX[index + 1 :]]

@@ -154,8 +154,7 @@ def covered(result: CalibrationResult, g: np.ndarray) -> float:
 
 
 def chapters_of(
-    result: CalibrationResult,
-    truth: dict[str, np.ndarray] | None = None,
+    result: CalibrationResult, truth: dict[str, np.ndarray] | None = None
 ) -> list[Chapter]:
     """Return the chapters of the report that `selfcal report` writes."""
     return chapters(result, truth_arrays(result.error_map, truth))

@@ -339,10 +339,7 @@ def _angular(
 
 
 def _means(
-    values: np.ndarray,
-    group: np.ndarray,
-    count: np.ndarray,
-    fitted: int = 0,
+    values: np.ndarray, group: np.ndarray, count: np.ndarray, fitted: int = 0
 ) -> tuple[np.ndarray, float, int]:
     """Return means (c, groups), the pooled standard deviation of one value, and its dof.
 

@@ -233,10 +233,7 @@ def test_the_first_files_are_tried_before_many_others(tmp_path):
     )
     assert watched.Watched(tmp_path, tmp_path).groups(
         "selfcal_ros/files.py", 2, 600
-    ) == [
-        tests[:4],
-        tests[4:],
-    ]
+    ) == [tests[:4], tests[4:]]
 
 
 WATCHING = """

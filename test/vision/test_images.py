@@ -124,10 +124,7 @@ def test_no_format_is_decoded_that_needs_a_program(monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", run)
     monkeypatch.setattr(os, "system", run)
     # Pillow would take it
-    assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (
-        100,
-        100,
-    )
+    assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (100, 100)
     with pytest.raises(
         InputError, match="not an image of a known kind, or damaged; give PNG"
     ):

@@ -144,9 +144,7 @@ def measured(
 
 
 def _collected(
-    truth: Truth,
-    case: Case,
-    rng: np.random.Generator,
+    truth: Truth, case: Case, rng: np.random.Generator
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the readings, and what is said of them, as `selfcal solve` has them from a bag."""
     collector = gathered(

@@ -137,11 +137,7 @@ class AxisSamples:
 
 
 def _track(
-    axis: int,
-    start: float,
-    distance: float,
-    count: int,
-    rollover: float | None,
+    axis: int, start: float, distance: float, count: int, rollover: float | None
 ) -> tuple[AxisSamples, bool]:
     """Return the track and whether the entries have to be reversed."""
     if distance < 0:

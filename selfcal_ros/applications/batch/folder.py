@@ -215,8 +215,7 @@ def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:
 
 
 def done_and_to_do(
-    kept: Sequence[Record],
-    bags: Sequence[Path],
+    kept: Sequence[Record], bags: Sequence[Path]
 ) -> tuple[dict[int, Record], list[int]]:
     """Return the records of finished bags, by their index in `bags`, and the other indices.
 

@@ -72,8 +72,7 @@ def run_job(job: folder.BatchJob) -> folder.Record:
 
 
 def solved(
-    job: folder.BatchJob,
-    source: dict[str, str],
+    job: folder.BatchJob, source: dict[str, str]
 ) -> tuple[results.CalibrationResult, NotIdentifiableError | None]:
     """Return the result of a bag, as from `selfcal solve`, and the reason if it has no map."""
     settings = job.settings

@@ -184,11 +184,7 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
 
 
 def _cec_grid(
-    table: int,
-    values: dict,
-    settings: dict,
-    axes: dict[str, int],
-    where: str,
+    table: int, values: dict, settings: dict, axes: dict[str, int], where: str
 ) -> tuple[int, int, Grid]:
     """Return input axis, output axis and values of a table."""
     table_settings: list[Any] = [settings.get((table, key)) for key in CEC_KEYS]

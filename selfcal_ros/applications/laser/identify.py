@@ -246,10 +246,7 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
     return rms(np.array(misfit))
 
 
-def jacobian(
-    function: Callable[[np.ndarray], np.ndarray],
-    x: np.ndarray,
-) -> np.ndarray:
+def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
     The formulations are linear except for terms of (error / step)^2, so the differences are

@@ -20,13 +20,7 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, titled
-from selfcal_ros.units import (
-    M_PER_MM,
-    MM_PER_M,
-    MRAD_PER_RAD,
-    UM_PER_M,
-    UM_PER_MM,
-)
+from selfcal_ros.units import M_PER_MM, MM_PER_M, MRAD_PER_RAD, UM_PER_M, UM_PER_MM
 
 SCHEMA = "selfcal.step_diagonal/1"
 CONVENTION = {

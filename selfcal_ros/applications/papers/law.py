@@ -116,10 +116,7 @@ class HuLaw:
         # eq. 22
         r = ((u0x * x - u0y * y) - (u1x * y + u1y * x)).sum(axis=(0, 1)) / (2 * d)
         # eq. 23
-        quarter = (
-            u0x - u1y - 2 * o * y - 2 * r * x,
-            u0y + u1x - 2 * o * x + 2 * r * y,
-        )
+        quarter = (u0x - u1y - 2 * o * y - 2 * r * x, u0y + u1x - 2 * o * x + 2 * r * y)
         step = (u3x - u0x[:-1], u3y - u0y[:-1])  # eq. 24
         # eq. 25
         right = np.concatenate(
@@ -237,9 +234,7 @@ def _first_order_rows(artifact: Artifact) -> np.ndarray:
 
 
 def _rows_theta(
-    count: int,
-    datum: ThetaDatum,
-    axis_lines: np.ndarray,
+    count: int, datum: ThetaDatum, axis_lines: np.ndarray
 ) -> tuple[sparse.csr_array, np.ndarray]:
     identity = _identity(count)
     k = np.arange(count)
@@ -257,8 +252,7 @@ def _rows_theta(
 
 
 def _bordered(
-    rows: sparse.csr_array,
-    ties: np.ndarray,
+    rows: sparse.csr_array, ties: np.ndarray
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return a least-squares solver for `rows` together with the few dense rows `ties`.
 
@@ -286,10 +280,7 @@ def _bordered(
         residual, slack = right - rows @ solution, tied - ties @ solution
         refinement = factor.solve(np.concatenate([rows.T @ residual, slack]))[:unknowns]
         # one refinement: to rounding
-        return (
-            solution + refinement,
-            residual - rows @ refinement,
-        )
+        return (solution + refinement, residual - rows @ refinement)
 
     return solve
 

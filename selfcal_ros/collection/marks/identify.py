@@ -194,9 +194,7 @@ def _astray(
 
 
 def _nearest(
-    pose: StagePose,
-    centred: np.ndarray,
-    artifact: Artifact,
+    pose: StagePose, centred: np.ndarray, artifact: Artifact
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return nearest mark (2, n), distance ratio to the second nearest, distance in m.
 

@@ -193,8 +193,7 @@ def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:
 
 
 def _least_squares(
-    p: np.ndarray,
-    deviation: np.ndarray,
+    p: np.ndarray, deviation: np.ndarray
 ) -> tuple[Rigid, tuple[float, float], float]:
     """Return the motion, the centre of the marks and the sum of squared distances from it."""
     middle, mean = p.mean(axis=1), deviation.mean(axis=1)

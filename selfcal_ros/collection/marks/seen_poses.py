@@ -229,9 +229,7 @@ def _found_pose(
 
 
 def _fitted(
-    marks: np.ndarray,
-    at: np.ndarray,
-    mirrored: bool,
+    marks: np.ndarray, at: np.ndarray, mirrored: bool
 ) -> tuple[complex, complex, float]:
     """Return the turn, the shift and what nine of ten distances are below, pitches."""
     z = marks.conj() if mirrored else marks

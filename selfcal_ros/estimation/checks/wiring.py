@@ -228,9 +228,7 @@ def _wirings(n: int) -> tuple[np.ndarray, ...]:
 
 
 def _wrong(
-    motion: RepeatMotion,
-    axes: tuple[str, ...],
-    level: float,
+    motion: RepeatMotion, axes: tuple[str, ...], level: float
 ) -> tuple[OffsetResponse, ...]:
     """Return the offsets that follow the stage wrongly; none if in doubt."""
     limits = HALVED, DOUBLED

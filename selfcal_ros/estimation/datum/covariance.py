@@ -29,11 +29,7 @@ from scipy.special import chdtrc
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.normal.equations import (
-    BLOCK,
-    NormalEquations,
-    in_datum,
-)
+from selfcal_ros.estimation.normal.equations import BLOCK, NormalEquations, in_datum
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceKind, ReferenceLength

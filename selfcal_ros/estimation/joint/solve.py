@@ -16,11 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from selfcal_ros.errors import (
-    NoDataError,
-    NotIdentifiableError,
-    NotSettledError,
-)
+from selfcal_ros.errors import NoDataError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.datum.covariance import (
     NO_NOISE,

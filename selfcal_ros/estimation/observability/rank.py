@@ -563,11 +563,7 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
 
 @lru_cache(maxsize=1024)
 def _forms(
-    turn: float,
-    shift: complex,
-    *,
-    square: bool,
-    listed: bool,
+    turn: float, shift: complex, *, square: bool, listed: bool
 ) -> tuple[tuple[float, float, float], ...]:
     """Return a view's turn and shift in each of the symmetries: thousands of plans share it."""
     if listed:

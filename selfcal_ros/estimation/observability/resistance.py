@@ -517,9 +517,7 @@ def _line(
 
 
 def effects_of_terms(
-    plan: Plan,
-    terms: Iterable[ModelTerm],
-    assumed: Assumed,
+    plan: Plan, terms: Iterable[ModelTerm], assumed: Assumed
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the variances of the XY map (2, sites), m^2, and of the lines (K,), rad^2, by term."""
     system = planned_system(plan.artifact, plan.views)

@@ -522,9 +522,7 @@ def _search(
 
 
 def _exchange(
-    key: Callable[[tuple[int, ...]], tuple[float, ...]],
-    n_pool: int,
-    free: int,
+    key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, free: int
 ) -> dict[tuple[int, ...], tuple[float, ...]]:
     """Search by greedy choice and exchange; return every plan tried with its key."""
     tried: dict[tuple[int, ...], tuple[float, ...]] = {}

@@ -589,11 +589,7 @@ def _without_slips(
             screened, flattened=flattened, residuals=residuals_of(flattened, linear)
         )
     return replace(
-        screened,
-        notes=(
-            *screened.notes,
-            SlipsGivenUp(slips=len(screened.slips)),
-        ),
+        screened, notes=(*screened.notes, SlipsGivenUp(slips=len(screened.slips)))
     )
 
 

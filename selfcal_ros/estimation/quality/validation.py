@@ -552,11 +552,7 @@ def _ratio_and_limit(
         if term.free and term.block.by_placing
     ]
     if own_terms and -1 in held_out.rows:
-        return (
-            ratio,
-            NOTHING,
-            OwnTermsUnknown(terms=tuple(own_terms)),
-        )
+        return (ratio, NOTHING, OwnTermsUnknown(terms=tuple(own_terms)))
     if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
         return ratio, NOTHING, None
     return (

@@ -301,10 +301,7 @@ class _ReadMarks:
     u: float
 
     def remaining_at(
-        self,
-        plate: np.ndarray,
-        artifact: Artifact,
-        pose: tuple[complex, complex],
+        self, plate: np.ndarray, artifact: Artifact, pose: tuple[complex, complex]
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return what the known plate leaves, and of which readings; None if they are not on it.
 

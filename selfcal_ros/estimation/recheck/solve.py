@@ -93,12 +93,7 @@ from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
-from selfcal_ros.model.verdict import (
-    Grade,
-    ModelResult,
-    TermResult,
-    Verdict,
-)
+from selfcal_ros.model.verdict import Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import Plan, cells_seen
 
 

@@ -36,13 +36,7 @@ from selfcal_ros.estimation.terms.visits import TermInputs, term_inputs
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
-from selfcal_ros.model.view import (
-    DEFAULT_ORDER,
-    Plan,
-    View,
-    parse_order,
-    placings_of,
-)
+from selfcal_ros.model.view import DEFAULT_ORDER, Plan, View, parse_order, placings_of
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
 SPREAD = ((0.56, 0.0941), (0.40, 0.0741), (0.48, 0.4291))

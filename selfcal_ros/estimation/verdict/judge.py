@@ -39,10 +39,7 @@ from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
-from selfcal_ros.estimation.verdict.search import (
-    ALWAYS_SITES,
-    search_causes,
-)
+from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
     Effect,
@@ -442,10 +439,7 @@ def _lines_sign_findings(
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
     turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
     # of the readings before they were turned into the frame of the plate
-    for sign in (
-        1,
-        -1,
-    ):
+    for sign in (1, -1):
         y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
         read = replace(problem, angular=replace(angular, y=y))
         squared.append(squares(read, fit(read, model.y), of_noise=False)[0])

@@ -183,9 +183,8 @@ class CellCheck:
         self._foreign: dict[
             str, str
         ] = {}  # ERRORs on /diagnostics, by the names of their statuses
-        self._has_unread = (
-            False  # whether there were more of them at a time than are kept
-        )
+        # whether there were more of them at a time than are kept
+        self._has_unread = False
         self._n_early = 0  # detections between PLACE and MEASURE
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived

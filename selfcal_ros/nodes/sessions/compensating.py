@@ -70,9 +70,8 @@ class CompensatingSession:
         self._strange: tuple[
             str, ...
         ] = ()  # joints of the last sample without one of the stage
-        self._other_frame = (
-            ""  # of the last command that names another than the stage's
-        )
+        # of the last command that names another than the stage's
+        self._other_frame = ""
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = self._contradicted = ""

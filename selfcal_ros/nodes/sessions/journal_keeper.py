@@ -224,9 +224,8 @@ class JournalKeeper:
                 return
         except InputError as error:
             if getattr(error.__cause__, "errno", None) not in NO_ROOM:
-                self._folder = (
-                    ""  # else one would be started beside it, and be the newest
-                )
+                # else one would be started beside it, and be the newest
+                self._folder = ""
                 raise
             self._fail(error)
         self.looked_at = str(self._claim.path if self._claim else self._folder)

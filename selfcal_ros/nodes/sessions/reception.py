@@ -101,9 +101,8 @@ class Reception:
         """Have the unfinished run read, once it is known that there is one."""
         try:
             files = self.journal.earlier()
-        except (
-            Exception
-        ) as error:  # messages are used in any case, with or without journal
+        except Exception as error:
+            # messages are used in any case, with or without journal
             self._refuse("journal", error)
             return
         if files and self._worker is not None:
@@ -157,9 +156,8 @@ class Reception:
         self._write(waiting)
         try:
             self.journal.flush()
-        except (
-            Exception
-        ) as error:  # messages are used in any case, with or without journal
+        except Exception as error:
+            # messages are used in any case, with or without journal
             self._refuse("journal", error)
         if self.restoring:
             self._held += waiting
@@ -174,8 +172,7 @@ class Reception:
         return adopted or bool(came)
 
     def _believable(
-        self,
-        waiting: list[tuple[str, bytes, int, bool]],
+        self, waiting: list[tuple[str, bytes, int, bool]]
     ) -> list[tuple[str, bytes, int, bool]]:
         """Return messages not stamped in the future of this node; the rest is counted and reported.
 

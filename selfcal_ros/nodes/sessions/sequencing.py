@@ -65,9 +65,8 @@ class SequencingSession:
         self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
         self._stalled = self._set_back = self._silent = ""
-        self._strayed = (
-            False  # another publisher's command was not followed in this run
-        )
+        # another publisher's command was not followed in this run
+        self._strayed = False
         if self.waiting:
             self.machine.need_plan()
 
@@ -356,9 +355,8 @@ class SequencingSession:
         for command in commands:
             now_ns = self._ports.now_ns()
             if not self.run_id and is_future(self._commanded_ns, now_ns):
-                self._commanded_ns = (
-                    0  # the clock was set back: a new run uses its time
-                )
+                # the clock was set back: a new run uses its time
+                self._commanded_ns = 0
             stamp = stamp_ns or max(now_ns, self._commanded_ns + 1)
             self._strayed &= bool(self.run_id)
             self.run_id = self.run_id or str(stamp)

@@ -263,9 +263,8 @@ class SolvingSession:
         if run in (self._run, PlanRun(self._run.plan_id)) and (
             command.views_planned > n_planned or (ends and tells)
         ):
-            self._stale = (
-                True  # the summary shows the number of planned or remaining views
-            )
+            # the summary shows the number of planned or remaining views
+            self._stale = True
 
     def _planned_views(self, run: PlanRun) -> int:
         """Return the number of planned views; commands without a run count for all runs."""
@@ -467,9 +466,8 @@ class SolvingSession:
         try:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
             write_json(path, results.result_to_dict(results.created_now(result)))
-        except (
-            InputError
-        ) as error:  # the map itself is good, and save_map may use another path
+        except InputError as error:
+            # the map itself is good, and save_map may use another path
             self._tried_s = self._ports.now_s()
             if not self._unsaved:
                 self._ports.say(Level.ERROR, f"save_path: {error}")

@@ -361,8 +361,7 @@ def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, floa
 
 
 def truth_arrays(
-    emap: ErrorMap,
-    truth: Mapping[str, np.ndarray] | None,
+    emap: ErrorMap, truth: Mapping[str, np.ndarray] | None
 ) -> dict[str, np.ndarray] | None:
     """Return the truth as float arrays on the lattice of `emap`; None stays None.
 

@@ -240,7 +240,4 @@ def test_2d_home_outside_loses_its_zero_bias():
     )
     assert [
         text.split("table, ")[1] for _, text in findings(longer, Severity.WARNING)
-    ] == [
-        "which covers 1 to 21: no zero bias",
-        "which covers 1 to 11: no zero bias",
-    ]
+    ] == ["which covers 1 to 21: no zero bias", "which covers 1 to 11: no zero bias"]

@@ -76,9 +76,8 @@ def test_squareness_is_positive_where_the_axes_enclose_less_than_90_deg(line):
     assert squareness(found, line=line).value == pytest.approx(4e-7)
     assert squareness_rad(found, line=line) == pytest.approx(1e-7 / 0.005)
     errors = np.zeros((2, 4, 2))
-    errors[0, :, 1] = (
-        1e-7  # X leans towards +Y: 1e-7/0.01 rad over the Y range of 20 mm
-    )
+    # X leans towards +Y: 1e-7/0.01 rad over the Y range of 20 mm
+    errors[0, :, 1] = 1e-7
     assert squareness(
         identified((0.01, 0.005), errors), line=line
     ).value == pytest.approx(2e-7)

@@ -694,12 +694,7 @@ def test_an_error_map_comes_back(result):
         found.datum_theta,
         found.nonorthogonality,
         found.scale_difference,
-    ) == (
-        emap.artifact,
-        ThetaDatum.ZERO_MEAN,
-        1.5e-6,
-        -2.5e-6,
-    )
+    ) == (emap.artifact, ThetaDatum.ZERO_MEAN, 1.5e-6, -2.5e-6)
     for m in range(-2, 3):
         for n in range(-3, 4):
             at = (m + 2) * 7 + (n + 3)

@@ -215,10 +215,7 @@ def test_motion_along_a_diagonal_tells_no_exchange_but_a_sign():
     )
     assert found(
         motion(np.random.default_rng(5), correlation=1.0, wiring=WIRINGS["-x-y"])
-    ) == {
-        "x": ("x", 1.0),
-        "y": ("y", 1.0),
-    }
+    ) == {"x": ("x", 1.0), "y": ("y", 1.0)}
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import (
-    covariance_of,
-    first_order_u,
-)
+from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact

@@ -11,10 +11,7 @@ from scipy.stats import binom
 from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.quality import validation
-from selfcal_ros.estimation.quality.validation import (
-    judged_by,
-    validate,
-)
+from selfcal_ros.estimation.quality.validation import judged_by, validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm

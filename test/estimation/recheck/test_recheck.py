@@ -13,10 +13,7 @@ from scipy.stats import chi2, f
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import (
-    covariance_of,
-    first_order_u,
-)
+from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.problem import noise_estimate
 from selfcal_ros.estimation.normal.angular import AngularSystem

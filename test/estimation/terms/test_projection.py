@@ -8,10 +8,7 @@ from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_of
-from selfcal_ros.estimation.terms.equations import (
-    project,
-    reduce_columns,
-)
+from selfcal_ros.estimation.terms.equations import project, reduce_columns
 from selfcal_ros.model.pose import LatticePose
 
 POSES = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, -1))

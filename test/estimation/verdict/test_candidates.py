@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.equations import Score, Sums
-from selfcal_ros.estimation.verdict.causes import (
-    Candidates,
-    Group,
-    select_explanations,
-)
+from selfcal_ros.estimation.verdict.causes import Candidates, Group, select_explanations
 
 LENGTHS = np.array([2.0, 0.5, 4.0])
 """Of three columns that all marks' means tell alone, in weighted readings."""

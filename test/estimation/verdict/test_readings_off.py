@@ -166,8 +166,5 @@ def test_those_with_the_largest_residuals_are_tried():
     first = columns.grid[np.array(suspects[0][0])]
     assert np.count_nonzero(columns.grid) == 2 * MOST
     # stage x, then stage y, in the plate's frame
-    assert first[:, 1, 0, 2].tolist() == [
-        -1j,
-        1,
-    ]
+    assert first[:, 1, 0, 2].tolist() == [-1j, 1]
     assert [c.component for c in columns.columns[:2]] == ["x", "y"]

@@ -108,10 +108,7 @@ def test_a_view_of_which_nothing_came_is_published_empty_when_it_is_over_as_offl
     cell = Cell().feed(events)
     assert [
         (fields["view_index"], len(fields["m"])) for fields in cell.of("measurement")
-    ] == [
-        (0, 0),
-        (1, 25),
-    ]
+    ] == [(0, 0), (1, 25)]
     assert [len(view.m) for view in gathered(events).collect()[0].views] == [0, 25]
     begun = [e for e in events if isinstance(e, Command)][:2]
     assert Cell().feed(begun).of("measurement") == []  # it is still to be measured

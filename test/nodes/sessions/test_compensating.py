@@ -690,12 +690,7 @@ def test_of_the_bytes_of_a_sample_the_positions_alone_change(busy):
         list(message.velocity),
         message.header.frame_id,
         numbers([message]),
-    ) == (
-        NAMES,
-        [1.0, 2.0, 3.0],
-        "stage",
-        [7],
-    )
+    ) == (NAMES, [1.0, 2.0, 3.0], "stage", [7])
 
 
 @pytest.mark.parametrize(

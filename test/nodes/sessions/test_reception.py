@@ -322,10 +322,7 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
     worker = Later()
     second = Desk(tmp_path, worker).receive(events[cut:-6])
     # gone through, then read
-    for path in (
-        None,
-        first.keeper.path or first_path(tmp_path),
-    ):
+    for path in (None, first.keeper.path or first_path(tmp_path)):
         assert not second.reception.drain()
         told = second.reception.diagnosis()
         assert (told.level, told.message) == (

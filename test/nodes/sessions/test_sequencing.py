@@ -116,10 +116,7 @@ def test_each_command_starts_the_coverage_of_its_view_anew(measuring):
     assert (
         measuring.session.coverage,
         measuring.session.diagnosis().values["coverage"],
-    ) == (
-        0.0,
-        "0.000",
-    )
+    ) == (0.0, "0.000")
 
 
 def test_stamps_grow_where_the_clock_steps_back(measuring):

@@ -30,12 +30,7 @@ from selfcal_ros.reporting.figures.maps import (
     component_maps,
     error_map,
 )
-from selfcal_ros.reporting.figures.parts import (
-    Scale,
-    levels,
-    ordinal,
-    range_scale,
-)
+from selfcal_ros.reporting.figures.parts import Scale, levels, ordinal, range_scale
 from selfcal_ros.reporting.figures.places import plan_figure, rejected_in, rejected_map
 from selfcal_ros.reporting.figures.residuals import (
     courses,

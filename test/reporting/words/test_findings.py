@@ -523,10 +523,7 @@ FINDINGS = [
         "more than 10% of the readings contradict the others: none was removed; look for a wrong "
         "plan or a faulty view",
     ),
-    (
-        OutliersKept(),
-        "removing more outliers would leave the stage undetermined",
-    ),
+    (OutliersKept(), "removing more outliers would leave the stage undetermined"),
     (
         OutliersGivenUp(rounds=60),
         "gave up on outliers after 60 rounds: the readings seem to contain more; look for a wrong "
@@ -744,10 +741,7 @@ def test_a_result_is_worded_once_and_only_then_written():
         result_of(random_map(Artifact(3, 0.01, 8), 1)),
         warnings=("as read",),
         verdict=Verdict(Grade.NOT_QUALIFIED, (NoiseUnknown(),), (TURN,)),
-        findings=(
-            OutliersKept(),
-            SlipsGivenUp(slips=3),
-        ),
+        findings=(OutliersKept(), SlipsGivenUp(slips=3)),
     )
     for part in (bare, replace(bare, findings=())):
         with pytest.raises(ValueError, match=re.escape("is not worded")):
