@@ -210,8 +210,8 @@ def test_without_dask_it_is_said_how_to_get_it(monkeypatch):
     with pytest.raises(InputError) as caught:
         list(outcomes(math.sqrt, [1.0], dask="local"))
     assert str(caught.value) == (
-        "--dask: there is no dask.distributed in this environment; "
-        "install it: pip install 'selfcal_ros[dask]'"
+        "--dask: there is no dask.distributed in this environment; install it: pip "
+        "install 'selfcal_ros[dask]'"
     )
 
 

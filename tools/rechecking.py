@@ -235,8 +235,8 @@ def main() -> int:
             for changes in (False, True)
         )
         print(
-            f"| {plan} | {len(found)} | {sum(one[0] for one in found)} | "
-            f"{sum(same)} of {len(same)}, {sum(other)} of {len(other)} | "
+            f"| {plan} | {len(found)} | {sum(one[0] for one in found)} | {sum(same)} "
+            f"of {len(same)}, {sum(other)} of {len(other)} | "
             f"{100 * np.mean([one[2] for one in found]):.1f} % | "
             f"{np.sqrt(np.mean([one[3] ** 2 for one in found])):.3f} |",
             flush=True,

@@ -93,12 +93,11 @@ RESULT = {
     "`findings`, and effect_rms, effect_max, told (whether the readings determine it "
     "all), remedies (a list of {model}, {map}, {view} to measure again, {action})",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
-    "(view, component, value, u, unit), "
-    "size_used (if the readings contradict the size), source (declared, default, "
-    "readings)",
+    "(view, component, value, u, unit), size_used (if the readings contradict the "
+    "size), source (declared, default, readings)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without; "
-    "with `reference_at` `certified`: its numbers and temperatures; "
-    "of the kind marks `marks`: their (m, n)",
+    "with `reference_at` `certified`: its numbers and temperatures; of the kind marks "
+    "`marks`: their (m, n)",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
     "visit_order of each view",
     "dof": "degrees of freedom of the map's uncertainty at its nodes, Welch-Satterthwaite: xy, "
@@ -128,13 +127,12 @@ RESULT = {
     "default), details, text",
     "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
-    "those of lack_of_fit add to variances alone; "
-    "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
-    "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
-    "microscope, (r, 4), the last two times the plate's longer half width; "
-    "with_map: how many of them belong to the factors; effects_on_plate: what "
-    "effects outside the model add to the variance of the plate's map, "
-    "(2, nx, ny), over σ²",
+    "those of lack_of_fit add to variances alone; up to 31 × 31 sites, and not with "
+    "`--model none`; beside: what they make of the plate, (r, 2, N, N), of both "
+    "angular maps, (r, 2, K), and of the microscope, (r, 4), the last two times the "
+    "plate's longer half width; with_map: how many of them belong to the factors; "
+    "effects_on_plate: what effects outside the model add to the variance of the "
+    "plate's map, (2, nx, ny), over σ²",
     "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
     "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
@@ -145,8 +143,8 @@ SOMETIMES = {
     "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
     "(_theta)",
     "map_covariance": "covariance of a mean map or a recheck up to 21 × 21 sites, lower "
-    "triangles over Gx, then Gy, of the known sites (`xy`) and over the known "
-    "lines (`theta`), in units of scale_xy (m²), scale_theta (rad²)",
+    "triangles over Gx, then Gy, of the known sites (`xy`) and over the known lines "
+    "(`theta`), in units of scale_xy (m²), scale_theta (rad²)",
     "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",

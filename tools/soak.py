@@ -430,8 +430,8 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
         + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items())
     )
     print(
-        f"status          median {statistics.median(cell.status_ms):.1f} ms, "
-        f"max {cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU"
+        f"status          median {statistics.median(cell.status_ms):.1f} ms, max "
+        f"{cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU"
     )
     print(
         "collector's CPU "

@@ -100,9 +100,9 @@ def refuse_beyond(limit: int, size: int) -> None:
     """Raise TooLargeError if `size` bytes are more than `limit`."""
     if size > limit:
         raise TooLargeError(
-            f"it would decompress to {size / BYTES_PER_MB:,.0f} MB, more than "
-            f"the {limit / BYTES_PER_MB:,.0f} MB that its size, the file and the "
-            "memory allow"
+            f"it would decompress to {size / BYTES_PER_MB:,.0f} MB, more than the "
+            f"{limit / BYTES_PER_MB:,.0f} MB that its size, the file and the memory "
+            "allow"
         )
 
 
@@ -184,8 +184,8 @@ def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
                 ) from error
             except zstandard.ZstdError as error:
                 lost.append(
-                    f"the compression of the file is damaged "
-                    f"({first_line(error)}): what follows is lost"
+                    f"the compression of the file is damaged ({first_line(error)}): "
+                    "what follows is lost"
                 )
             if not plain.tell():
                 raise InputError(

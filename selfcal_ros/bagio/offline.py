@@ -150,8 +150,8 @@ def collect_bag(
         )
         raise NoDataError(
             str(path),
-            f"none of {received['detection']} detections became a "
-            f"reading (rejected: {reasons}){tail}",
+            f"none of {received['detection']} detections became a reading (rejected: "
+            f"{reasons}){tail}",
             [*clock, *findings, "correct the first cause named"][0],
         )
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
@@ -359,8 +359,8 @@ class Playlist:
         if not images or not has_detections:
             return bool(images)
         self.lost.append(
-            f"images on {', '.join(images)} are not played: "
-            f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them"
+            f"images on {', '.join(images)} are not played: selfcal detect {self._bag} "
+            "-o FOUND_BAG makes detections of them"
         )
         return False
 

@@ -335,8 +335,8 @@ class ChannelDecoder:
             ""
             if self.told
             else (
-                f": the bag has no definition of {self.name}, and they do not "
-                "fit the one known here"
+                f": the bag has no definition of {self.name}, and they do not fit the "
+                "one known here"
             )
         )
         self._columns = (

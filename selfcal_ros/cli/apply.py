@@ -58,8 +58,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=("empty", "edge", "refuse"),
         default="empty",
         help="points outside the field, where u is not known: leave them empty "
-        "and end with code 5 (default), use the error at the edge of the "
-        "field, or refuse",
+        "and end with code 5 (default), use the error at the edge of the field, or "
+        "refuse",
     )
     add_json(parser)
 
@@ -127,9 +127,8 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
     farthest = places[beyond.argmax()]
     raise InputError(
         where,
-        f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from "
-        f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in "
-        "mm?",
+        f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from {-y:g} "
+        f"to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in mm?",
         "give positions in m, in the stage frame",
     )
 

@@ -419,8 +419,8 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     filled = 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(
-            f"{args.result}: the measured plan does not identify the stage; "
-            "measure the missing views",
+            f"{args.result}: the measured plan does not identify the stage; measure "
+            "the missing views",
             result.observability,
         )
     if not args.steep:
@@ -487,8 +487,8 @@ def _verify(args: argparse.Namespace) -> int:
     if verification.worse and one_axis is not None and not unfit_parts:
         raise InputError(
             cal.where,
-            "the tables make the middle line better and the field worse: "
-            "most of the error depends on both positions",
+            "the tables make the middle line better and the field worse: most of the "
+            "error depends on both positions",
             "write a 2D table (selfcal cal export)",
         )
     if verification.worse:

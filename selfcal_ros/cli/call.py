@@ -18,8 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "request",
         choices=REQUESTS,
         help="start: begin the plan; confirm: the "
-        "plate is in place; redo: measure the view again; skip: continue "
-        "without it; abort: end the plan",
+        "plate is in place; redo: measure the view again; skip: continue without it; "
+        "abort: end the plan",
     )
     parser.add_argument(
         "--namespace", metavar="NS", default="", help="namespace of the cell"

@@ -93,10 +93,10 @@ def _text(result: CalibrationResult, figures: dict[str, Any]) -> str:
     ]
     if "u_between_rad" in figures:
         lines.append(
-            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
-            f"rms (k = {noise.k_theta:.3g}), between runs "
-            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
-            f"p = {figures['p_between_theta']:.2g}"
+            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} "
+            f"arcsec rms (k = {noise.k_theta:.3g}), between runs "
+            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, p = "
+            f"{figures['p_between_theta']:.2g}"
         )
     lines.append("each map against the mean of the others:")
     for run in figures["runs"]:

@@ -191,17 +191,17 @@ def _json(difference: MapDifference) -> dict[str, Any]:
 def _text(difference: MapDifference, grades: Sequence[str], plates: bool) -> str:
     tx, ty = difference.translation_m
     lines = [
-        f"B minus A{', plates' if plates else ''}, datum difference removed: translation "
-        f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
-        f"rotation {_signed(difference.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
-        f"scale {_signed(difference.scale * UM_PER_M)} µm/m"
+        f"B minus A{', plates' if plates else ''}, datum difference removed: "
+        f"translation ({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
+        f"rotation {_signed(difference.rotation_rad * ARCSEC_PER_RAD)} arcsec, scale "
+        f"{_signed(difference.scale * UM_PER_M)} µm/m"
         + (
             ""
             if math.isnan(difference.theta_rad)
             else f", theta {_signed(difference.theta_rad * ARCSEC_PER_RAD)} arcsec"
         ),
-        f"XY     rms {difference.rms_m * UM_PER_M:.5f} µm per axis   "
-        f"largest {difference.max_m * UM_PER_M:.5f} µm on an axis",
+        f"XY     rms {difference.rms_m * UM_PER_M:.5f} µm per axis   largest "
+        f"{difference.max_m * UM_PER_M:.5f} µm on an axis",
         *_test_text(difference.xy),
         f"       non-orthogonality {_signed(difference.nonorthogonality * URAD_PER_RAD)} µrad, "
         f"scale difference {_signed(difference.scale_difference * UM_PER_M)} µm/m",

@@ -369,8 +369,8 @@ def _nodes_text(plan: Plan) -> list[str]:
         []
         if grid is None
         else [
-            f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
-            f"apart, {grid.interpolation} between them"
+            f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm apart, "
+            f"{grid.interpolation} between them"
         ]
     )
     return nodes + (
@@ -425,9 +425,8 @@ def field_note(predicted: Prediction, plan: Plan) -> str:
         ""
         if (nx, ny) == plan.artifact.field.shape
         else (
-            f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
-            "larger for each doubling of "
-            "the field"
+            f"predicted for a field of {nx} x {ny} sites; XY is about 5 % larger for "
+            "each doubling of the field"
         )
     )
 

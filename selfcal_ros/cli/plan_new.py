@@ -315,8 +315,8 @@ def _require_travel(answers: Known, artifact: Artifact) -> None:
             )
             raise InputError(
                 "--travel",
-                f"{travel * MM_PER_M:g} mm along {axis}, and {count} "
-                f"marks with their check stops need {span * MM_PER_M:g} mm",
+                f"{travel * MM_PER_M:g} mm along {axis}, and {count} marks with their "
+                f"check stops need {span * MM_PER_M:g} mm",
                 mend,
             )
 

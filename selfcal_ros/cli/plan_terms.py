@@ -43,8 +43,8 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="size of a term against which the plan is judged, a standard "
-        "deviation in SI units; TERM is microscope, drift, plate_scale, "
-        "plate_shape or approach; none: not even the terms assumed by default",
+        "deviation in SI units; TERM is microscope, drift, plate_scale, plate_shape "
+        "or approach; none: not even the terms assumed by default",
     )
     parser.add_argument(
         "--drift-degree",
@@ -76,8 +76,8 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
         metavar="LENGTH",
         default=STAGE_ERROR,
         help="errors of stage and plate, standard deviation per axis, m or with a "
-        f"unit (default {STAGE_ERROR}): the scale error of the microscope "
-        "multiplies them",
+        f"unit (default {STAGE_ERROR}): the scale error of the microscope multiplies "
+        "them",
     )
     parser.add_argument(
         "--placing",

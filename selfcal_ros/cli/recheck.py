@@ -92,9 +92,8 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     tell(
         "\n".join(
             [
-                f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of "
-                "the plate calibrated in "
-                f"{plan.artifact_from}",
+                f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the "
+                f"plate calibrated in {plan.artifact_from}",
                 *(
                     [
                         f"{prediction.map.n_unknown} of {prediction.map.ux.size} nodes of the "

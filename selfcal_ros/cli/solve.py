@@ -84,9 +84,9 @@ def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> 
         metavar="KIND:ERROR:U",
         help="known length that sets the "
         "scale: artifact, stage_x or stage_y, its relative error and the standard "
-        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
-        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
-        "marks marks:ID:ID:LENGTH:U",
+        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance of two "
+        "marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of marks "
+        "marks:ID:ID:LENGTH:U",
     )
     parser.set_defaults(validate=False)
     parser.add_argument(
@@ -146,8 +146,8 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
         action="append",
         help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
-        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
-        "terms, not even those assumed by default (docs/theory/estimation.md)",
+        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no terms, "
+        "not even those assumed by default (docs/theory/estimation.md)",
     )
     parser.add_argument(
         "--microscope",
@@ -266,8 +266,8 @@ def run(args: argparse.Namespace) -> int:
     if options.plate is not None and args.validate:
         raise InputError(
             "--validate",
-            f"the plate is known from {options.plate_from}, and one "
-            "view has nothing to check its readings against",
+            f"the plate is known from {options.plate_from}, and one view has nothing "
+            "to check its readings against",
             "omit it",
         )
     try:
@@ -301,8 +301,8 @@ def run(args: argparse.Namespace) -> int:
     ):
         raise InputError(
             args.bag,
-            f"the recording that {options.plate_from} was computed "
-            "from: it would be compared with itself",
+            f"the recording that {options.plate_from} was computed from: it would be "
+            "compared with itself",
             "record a new view of the plate",
         )
     with busy("validating"):

@@ -68,8 +68,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DATA.csv|BAG",
         nargs="?",
         help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
-        "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
-        "rx_npp, ... [, ez_z]",
+        "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, rx_npp, ... "
+        "[, ez_z]",
     )
     parser.add_argument(
         "--method",
@@ -272,9 +272,8 @@ def _simulate(args: argparse.Namespace) -> int:
         data,
         [
             f"simulated from {args.simulate}; mm; several rows of a block are repeats",
-            "readings are positive on every diagonal (np: rx = -l.dx); a "
-            "block is a position on the "
-            "axis",
+            "readings are positive on every diagonal (np: rx = -l.dx); a block is a "
+            "position on the axis",
             "ex_x, ey_y: directly measured linear errors, actual - nominal of each step",
         ],
     )

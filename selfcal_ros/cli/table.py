@@ -43,8 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.csv|.npz",
         required=True,
         help="table to write: a line for each site, then one for each angular "
-        "line (csv, SI units, empty = unknown), or arrays (npz); "
-        "- = csv to stdout",
+        "line (csv, SI units, empty = unknown), or arrays (npz); - = csv to stdout",
     )
     add_json(parser)
 

@@ -19,8 +19,8 @@ GROUP, BESIDE = 5, 3
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
 REMEDY = (
-    "let clocks slew, not step, while a run is measured "
-    "(chrony, ptp4l: no step after the start)"
+    "let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after "
+    "the start)"
 )
 Span = tuple[np.ndarray, np.ndarray]
 """Lowest and highest of offset, stamp and reception, each (3, n)."""

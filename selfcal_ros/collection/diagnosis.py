@@ -113,8 +113,8 @@ class RejectionFinding:
         if not self.count:
             return self.text
         return (
-            f"{self.count} of {self.total} detections were rejected as "
-            f"{self.reason}: {self.text}"
+            f"{self.count} of {self.total} detections were rejected as {self.reason}: "
+            f"{self.text}"
         )
 
 

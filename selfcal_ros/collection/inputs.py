@@ -339,8 +339,8 @@ class Reason(StrEnum):
 
 ADVICE = {
     Reason.ROTATION: "the view's rotation is not known well enough to tell these marks or lines "
-    "from their neighbours; give the detections ids, or measure grid marks "
-    "in the same view, or state a max_rotation of less than half a line",
+    "from their neighbours; give the detections ids, or measure grid marks in the "
+    "same view, or state a max_rotation of less than half a line",
     Reason.BAD_SIGMA: "their sigma is not a standard uncertainty in m or rad (1e-12 to 1000, 0 = "
     "not known), or 10,000 times smaller than that of the others; correct the "
     "publisher of the detections",
@@ -375,9 +375,8 @@ REMEDY = {
     Reason.NOT_AT_MARK: "the stage does not stand at the detected marks; check joint_x, "
     "joint_y and measurement_sense, or set max_stage_distance",
     Reason.OUTSIDE_IMAGE: "they lie beyond the marks that an image shows; raise nx and ny under "
-    "image in the plan, or if the plate lies half a pitch or more off its "
-    "place: state that in the plan (translation_mm of the views), or give "
-    "the detections ids",
+    "image in the plan, or if the plate lies half a pitch or more off its place: "
+    "state that in the plan (translation_mm of the views), or give the detections ids",
     Reason.SEVERAL: "an exposure shows several marks, but the plan expects one; state in the plan "
     "how many an image shows (image: {nx: 3, ny: 3}), or publish only the mark "
     "nearest to the optical axis",

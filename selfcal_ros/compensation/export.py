@@ -163,6 +163,6 @@ def _reference_lines(result: CalibrationResult) -> list[str]:
         return ["reference length: none, the scale is a convention"]
     certificate = length.certificate or "no certificate named"
     return [
-        f"reference length: {length.name}, relative error "
-        f"{length.relative_error:g}, u {length.u_relative:g} ({certificate})"
+        f"reference length: {length.name}, relative error {length.relative_error:g}, u "
+        f"{length.u_relative:g} ({certificate})"
     ]

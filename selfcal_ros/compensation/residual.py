@@ -217,8 +217,8 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
         raise _misfit(
             active,
             (px, py),
-            f"changes by up to {step_m / M_PER_MM:.3g} mm between "
-            f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart",
+            f"changes by up to {step_m / M_PER_MM:.3g} mm between neighbouring sites "
+            f"{plate.grid_pitch_m / M_PER_MM:g} mm apart",
             frame.unit,
         )
     gx, gy = map_error + added
@@ -245,8 +245,8 @@ def _misfit(
         )
         return InputError(
             "--onto",
-            f"the active table covers only part of the field: {table} "
-            f"{unit}, the map {stage}; beyond it the table {fault}",
+            f"the active table covers only part of the field: {table} {unit}, the map "
+            f"{stage}; beyond it the table {fault}",
             "name the table of this stage, in this unit (--unit)",
         )
     return InputError(

@@ -303,8 +303,8 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
     if plate.result.kept.images is None:
         raise InputError(
             plate.where,
-            "its noise is not separated into that of images and that of "
-            "marks, but the readings have images of several marks",
+            "its noise is not separated into that of images and that of marks, but "
+            "the readings have images of several marks",
             "recheck with one mark an image, or calibrate with such images",
         )
     camera = known_camera(plate.result)

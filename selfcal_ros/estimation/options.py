@@ -96,8 +96,8 @@ class Options:
         if self.robust and self.plate is not None:
             raise InputError(
                 "robust",
-                f"the plate is known from {self.plate_from}, and one view "
-                "has nothing to check its readings against",
+                f"the plate is known from {self.plate_from}, and one view has nothing "
+                "to check its readings against",
                 "omit it",
             )
 

@@ -342,8 +342,8 @@ class Visitor:
         )
         if self.cell.detector and self.eye.newest is None:
             remedy = (
-                "the machine returns no images: check the camera, "
-                "or take detector out of CELL.yaml"
+                "the machine returns no images: check the camera, or take detector out "
+                "of CELL.yaml"
             )
         return NoDataError(
             f"view '{view.name}'",

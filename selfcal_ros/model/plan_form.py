@@ -106,8 +106,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
     if len(with_sub_views(views)) > MAX_VIEWS:
         raise InputError(
             f"{where}: image",
-            f"{len(with_sub_views(views))} views with the cells of "
-            f"the image are more than {MAX_VIEWS}",
+            f"{len(with_sub_views(views))} views with the cells of the image are more "
+            f"than {MAX_VIEWS}",
             "state fewer marks in an image",
         )
     if not views:

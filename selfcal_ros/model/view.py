@@ -295,8 +295,8 @@ class View:
             nx, ny = artifact.shape
             raise InputError(
                 f"view '{self.name}' translation",
-                f"after a quarter turn the rows of "
-                f"{nx} x {ny} marks lie between rows at a shift of {step:.6g} pitch",
+                f"after a quarter turn the rows of {nx} x {ny} marks lie between rows "
+                f"at a shift of {step:.6g} pitch",
                 f"shift it by [0.5, 0.5] pitch to place it on the {OFF}",
             )
         return whole_pitches + 0.5

@@ -98,10 +98,10 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         if missing and time.monotonic() > self._patience:
             raise InputError(
                 "bag_player",
-                f"{' and '.join(missing)} "
-                f"after {self.settings.wait_for_subscribers:g} s, nothing was played",
-                "start it, "
-                "name another node as listener, or set listener to '' to play without waiting",
+                f"{' and '.join(missing)} after "
+                f"{self.settings.wait_for_subscribers:g} s, nothing was played",
+                "start it, name another node as listener, or set listener to '' to "
+                "play without waiting",
             )
         return not missing
 

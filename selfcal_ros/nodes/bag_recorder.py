@@ -62,8 +62,8 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
         self.exit_code = error.exit_code
         self.say(
             Level.ERROR,
-            f"recording has ended: {error}; what was recorded is readable, "
-            "start again in another folder",
+            f"recording has ended: {error}; what was recorded is readable, start "
+            "again in another folder",
         )
 
     def _flush(self) -> None:

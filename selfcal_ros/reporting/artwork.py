@@ -247,8 +247,8 @@ def save_artwork(art: Artwork, path: str | os.PathLike, paper: str = "") -> None
         if right - left > across or high - low > along:
             raise InputError(
                 "--paper",
-                f"the plate needs {right - left:.0f} x {high - low:.0f} "
-                f"mm, and {paper} has {across:g} x {along:g} mm",
+                f"the plate needs {right - left:.0f} x {high - low:.0f} mm, and "
+                f"{paper} has {across:g} x {along:g} mm",
                 "omit --paper, or plan a smaller plate",
             )
         x, y = (right + left) / 2, (high + low) / 2

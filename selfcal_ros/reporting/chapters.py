@@ -263,14 +263,13 @@ def convention_section(result: CalibrationResult) -> Section:
         ("sense", _SENSE.get(result.sense, result.sense)),
         (
             "uncertainty",
-            "u is the standard uncertainty (k=1), U = k u the expanded one, "
-            "k from Student's t for 95.45 % at the degrees of freedom of the "
-            "uncertainty",
+            "u is the standard uncertainty (k=1), U = k u the expanded one, k from "
+            "Student's t for 95.45 % at the degrees of freedom of the uncertainty",
         ),
         (
             "misalignment",
-            "φ is the turn of the plate about its centre, counter-clockwise, "
-            "tx and ty its offset, beyond the nominal pose of the view",
+            "φ is the turn of the plate about its centre, counter-clockwise, tx and "
+            "ty its offset, beyond the nominal pose of the view",
         ),
     ]
     return Section("Conventions", tuple(facts))
@@ -389,13 +388,13 @@ def chapters(
             _figures(
                 (
                     camera_errors(result),
-                    "Each vector points from the true "
-                    "position of a mark in the image to the measured one.",
+                    "Each vector points from the true position of a mark in the image "
+                    "to the measured one.",
                 ),
                 (
                     stage_yaw(result),
-                    "Rotation of the image, and of whatever "
-                    "the stage carries, at each position of the stage.",
+                    "Rotation of the image, and of whatever the stage carries, at "
+                    "each position of the stage.",
                 ),
             ),
             (Section("Camera", camera_facts(result)),),
@@ -409,9 +408,8 @@ def chapters(
                     plan_figure(result.plate, views_in(result))
                     if result.views
                     else None,
-                    "The plate as the plan places it; the arrow shows how far "
-                    "its marked corner has "
-                    "turned.",
+                    "The plate as the plan places it; the arrow shows how far its "
+                    "marked corner has turned.",
                 )
             ),
             (sections.measurement_section(result), sections.views_section(result)),
@@ -639,19 +637,19 @@ def _residuals(result: CalibrationResult) -> Chapter:
     pairs = (
         (
             residual_maps(result, view_residuals),
-            "Residuals of the fit at each mark. Random directions are "
-            "noise; neighbours that point the same way are an effect outside the model.",
+            "Residuals of the fit at each mark. Random directions are noise; "
+            "neighbours that point the same way are an effect outside the model.",
         ),
         (
             distributions(view_residuals, "xy"),
-            "Bars against the normal curve of the same rms, and the same "
-            "residuals against normal quantiles: dots off the line at its ends are outliers.",
+            "Bars against the normal curve of the same rms, and the same residuals "
+            "against normal quantiles: dots off the line at its ends are outliers.",
         ),
         (distributions(view_residuals, "theta"), "The same for the angular lines."),
         (
             courses(view_residuals, result.noise.sigma_xy),
-            "Means over sixtieths of the view's duration. A "
-            "curve that leaves the band shows a drift.",
+            "Means over sixtieths of the view's duration. A curve that leaves the "
+            "band shows a drift.",
         ),
     )
     return Chapter("Residuals", _figures(*pairs))

@@ -310,8 +310,8 @@ class SolverSettings(ManagedSettings):
     )
     result_folder: str = declared(
         "",
-        "folder in which save_map may write, and to which paths are "
-        "relative; empty = the working directory",
+        "folder in which save_map may write, and to which paths are relative; empty = "
+        "the working directory",
     )
 
 
@@ -389,8 +389,8 @@ class CompensatorSettings(ManagedSettings):
     )
     map: str = declared(
         "",
-        "RESULT.json to start with, or a folder with an active map (selfcal "
-        "history); empty = wait for selfcal/error_map",
+        "RESULT.json to start with, or a folder with an active map (selfcal history); "
+        "empty = wait for selfcal/error_map",
     )
     require_qualified: bool = declared(
         True,
@@ -443,8 +443,8 @@ class PlayerSettings(Settings):
     )
     listener: str = declared(
         CollectorSettings.NODE,
-        "node that must subscribe to every topic of the bag before the "
-        "first message is played, in the player's namespace unless it begins with /; empty = play "
+        "node that must subscribe to every topic of the bag before the first message "
+        "is played, in the player's namespace unless it begins with /; empty = play "
         "without waiting",
     )
     wait_for_subscribers: float = declared(

@@ -102,9 +102,8 @@ class CellSettings:
         if DWELL * self.exposure_period_s * self.encoder_rate_hz < 2.5:
             raise InputError(
                 "simulated cell",
-                f"{self.encoder_rate_hz:g} Hz gives fewer than "
-                f"2.5 encoder samples in a dwell of "
-                f"{DWELL * self.exposure_period_s:g} s",
+                f"{self.encoder_rate_hz:g} Hz gives fewer than 2.5 encoder samples in "
+                f"a dwell of {DWELL * self.exposure_period_s:g} s",
                 "raise encoder_rate or exposure_period",
             )
         if self.visit_order:

@@ -178,8 +178,8 @@ def _similar(
     if not u[0] <= TOO_UNCERTAIN * components[0]:
         raise InputError(
             "images",
-            "the marks do not follow the stage: the size of a pixel has a "
-            f"standard uncertainty of {u[0] / components[0]:.2g} of itself",
+            "the marks do not follow the stage: the size of a pixel has a standard "
+            f"uncertainty of {u[0] / components[0]:.2g} of itself",
             "move the stage from image to image by less than half the distance of "
             "two marks, and check the positions",
         )

@@ -87,8 +87,8 @@ def picture_of(message: Any, check: Check = any_size) -> Picture:
     ):
         raise InputError(
             "image",
-            f"{len(message.data)} bytes in rows of {step} are not "
-            f"{width} x {height} pixels of {message.encoding}",
+            f"{len(message.data)} bytes in rows of {step} are not {width} x {height} "
+            f"pixels of {message.encoding}",
             "correct width, height, step and data",
         )
     check((height, width))

@@ -200,8 +200,8 @@ def test_a_compressed_message_that_is_a_bomb_is_counted(tmp_path, events, tight)
         }
         n_commands = sum(hasattr(event, "phase") for event in events)
         assert reader.lost == [
-            f"{n_commands} messages on /selfcal/view_command were not "
-            "decompressed: they would become too large"
+            f"{n_commands} messages on /selfcal/view_command were not decompressed: "
+            "they would become too large"
         ]
 
 

@@ -102,18 +102,18 @@ def test_kinds_are_seen_in_the_files(desk):
     [
         (
             "apply points.csv R.json -o o.csv",
-            "points.csv: is a table of numbers, and R.json is a "
-            "result: they are swapped; write `selfcal apply R.json points.csv -o o.csv`",
+            "points.csv: is a table of numbers, and R.json is a result: they are "
+            "swapped; write `selfcal apply R.json points.csv -o o.csv`",
         ),
         (
             "recheck bags/demo R.json",
-            "bags/demo: is a bag, and R.json is a result: they are swapped; "
-            "write `selfcal recheck R.json bags/demo`",
+            "bags/demo: is a bag, and R.json is a result: they are swapped; write "
+            "`selfcal recheck R.json bags/demo`",
         ),
         (
             "cal verify stage.cal R.json",
-            "stage.cal: is a calibration file, and R.json is a result: "
-            "they are swapped; write `selfcal cal verify R.json stage.cal`",
+            "stage.cal: is a calibration file, and R.json is a result: they are "
+            "swapped; write `selfcal cal verify R.json stage.cal`",
         ),
         (
             "solve R.json",
@@ -126,17 +126,14 @@ def test_kinds_are_seen_in_the_files(desk):
         ),
         (
             "plan check config/simulations/demo.yaml",
-            "config/simulations/demo.yaml: is a simulation, "
-            "and a plan is needed here; `selfcal simulate "
-            "config/simulations/demo.yaml -o BAG` writes "
-            "its bag",
+            "config/simulations/demo.yaml: is a simulation, and a plan is needed "
+            "here; `selfcal simulate config/simulations/demo.yaml -o BAG` writes its "
+            "bag",
         ),
         (
             "solve bags/demo --params config/plans/hu.yaml",
-            "config/plans/hu.yaml: is a plan, and a "
-            "parameter file of nodes is needed here; `selfcal plan check "
-            "config/plans/hu.yaml` says "
-            "what it determines",
+            "config/plans/hu.yaml: is a plan, and a parameter file of nodes is needed "
+            "here; `selfcal plan check config/plans/hu.yaml` says what it determines",
         ),
     ],
 )

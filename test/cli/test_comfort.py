@@ -51,8 +51,8 @@ def bag(tmp_path_factory):
         ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
         (
             "solve b --methd joint",
-            "selfcal solve: the option --methd is unknown; did you mean "
-            "'--method'?; see selfcal solve --help",
+            "selfcal solve: the option --methd is unknown; did you mean '--method'?; "
+            "see selfcal solve --help",
         ),
         (
             "solve b --method jiont",

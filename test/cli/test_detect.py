@@ -406,8 +406,8 @@ def own_values(data):
         ),
         (
             "file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:00\n",
-            ":2: '2026-11-21T09:30:00' is not a time with its zone; "
-            "write it as 2026-11-21T09:30:00.25+0",
+            ":2: '2026-11-21T09:30:00' is not a time with its zone; write it as "
+            "2026-11-21T09:30:00.25+0",
         ),
         (
             "file,view,x,y,time\na.png,shift,0,0,\n",
@@ -416,15 +416,13 @@ def own_values(data):
         (
             "file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:01Z\n"
             "b.png,shift,0,0,2026-11-21T10:30:01.05+01:00\n",
-            ":3: not exposed 0.1 s or more after a.png; give the times "
-            "in the order of the exposures",
+            ":3: not exposed 0.1 s or more after a.png; give the times in the order "
+            "of the exposures",
         ),
         (
             "file,view,x,y\na.png,shift,9,9\nb.png,shift,0,-1.2\nc.png,shift,0,0\n",
-            "p.csv: half of "
-            "the positions are over 1.2 m from the origin, the marks of "
-            "the plan within 0.0383 m; give x "
-            "and y in m",
+            "p.csv: half of the positions are over 1.2 m from the origin, the marks "
+            "of the plan within 0.0383 m; give x and y in m",
         ),
     ],
 )

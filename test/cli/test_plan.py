@@ -409,8 +409,8 @@ def test_a_plan_of_a_known_plate_leaves_open_whether_it_is_identified(capsys):
         (["--stage-error=-1nm"], "--stage-error: '-1nm' is not a positive length"),
         (
             ["--sigma-theta", "3 turns"],
-            "--sigma-theta: '3 turns' is not a positive angle; give rad, "
-            "or a number and one of rad, mrad, urad, deg, arcsec",
+            "--sigma-theta: '3 turns' is not a positive angle; give rad, or a number "
+            "and one of rad, mrad, urad, deg, arcsec",
         ),
         (["--placing", "0"], "--placing: '0' is not a positive angle"),
         (

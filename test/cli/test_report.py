@@ -107,8 +107,8 @@ def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
         ),
         (
             ["result.json", "-o", "a.html", "--plot", "a.gif"],
-            "a.gif: not a picture format by its suffix; name a file that "
-            "ends in .png, .svg or .pdf",
+            "a.gif: not a picture format by its suffix; name a file that ends in "
+            ".png, .svg or .pdf",
         ),
         (
             ["result.json", "-o", "a.txt"],

@@ -60,16 +60,15 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
         ),
         (
             told("PLACING", view_name="rot90"),
-            f"Place the plate for view 'rot90' turned by {TURN}, at x "
-            "10 mm, y -20 mm; then press c.",
+            f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 "
+            "mm; then press c.",
         ),
         (told("MEASURING"), "Nothing: the view is being measured."),
         (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
         (
             told("PLACING", "no sign of life from solver", 1),
-            f"Place the plate for view 'rot90' turned by {TURN}, at x 10 "
-            "mm, y -20 mm; then press c. "
-            "Look: no sign of life from solver.",
+            f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 "
+            "mm; then press c. Look: no sign of life from solver.",
         ),
         (told("DONE"), "Done. s starts another run."),
         (told("ABORTED"), "Aborted. s starts a new run."),
@@ -208,8 +207,7 @@ MEASURED = {
     },
     "summary": {
         "state": "Calibrated from 4 views: largest error 0.713 µm at x 30 mm, y 50 mm, "
-        "every site known to ±0.0483 µm, any place to ±0.0502 µm or better "
-        "(k=2.01).",
+        "every site known to ±0.0483 µm, any place to ±0.0502 µm or better (k=2.01).",
         "views": [4, 4],
         "identifiable": True,
         "qualified": True,

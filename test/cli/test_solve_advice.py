@@ -161,7 +161,7 @@ def test_reversed_offsets_are_one_line_that_names_the_bag_and_no_result(
         assert main(["solve", str(path), "-o", str(out), *more]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(
-            f"selfcal solve: {path}: plan '0, 90, tx', stage/mark_detections: "
-            "offsets of the other sign: offset_x and offset_y rise"
+            f"selfcal solve: {path}: plan '0, 90, tx', stage/mark_detections: offsets "
+            "of the other sign: offset_x and offset_y rise"
         )
         assert not out.exists()

@@ -14,8 +14,8 @@ ODD = [
     (
         {"translation_m": (1e17, 0.0)},
         {},
-        "view '0' translation: 1e+19 pitches are "
-        "beyond every field; is it in mm? give the translation in metres",
+        "view '0' translation: 1e+19 pitches are beyond every field; is it in mm? "
+        "give the translation in metres",
     ),
     ({"translation_m": (0.0, -1e300)}, {}, "view '0' translation: -"),
     (

@@ -109,14 +109,11 @@ def test_the_other_sense(sense):
         scene(count=0, sense=sense).events, measurement_sense=str(other)
     ) == {
         None: (
-            "24 of 25 detections were rejected as stage_not_at_mark: the "
-            "plate lies turned by 180°, "
-            "not by 0° (or its ids are those of other marks); turn it as "
-            "planned and measure this view "
-            "again, or correct its pose in the plan; or, if it lies as "
-            "planned: the stage is indicated "
-            "at minus the marks' sites; the "
-            f"sense is reversed: measurement_sense {sense} (--sense {sense})"
+            "24 of 25 detections were rejected as stage_not_at_mark: the plate lies "
+            "turned by 180°, not by 0° (or its ids are those of other marks); turn it "
+            "as planned and measure this view again, or correct its pose in the plan; "
+            "or, if it lies as planned: the stage is indicated at minus the marks' "
+            f"sites; the sense is reversed: measurement_sense {sense} (--sense {sense})"
         )
     }
 
@@ -143,8 +140,8 @@ def test_the_only_view_asks_for_the_pose_before_the_joints():
         ),
         (
             lambda x, y: (1e3 * x, 1e3 * y),
-            "the indicated positions are 1000 times those of the "
-            "marks: they are in mm; publish joint positions in metres",
+            "the indicated positions are 1000 times those of the marks: they are in "
+            "mm; publish joint positions in metres",
         ),
         (
             lambda x, y: (1e6 * x, 1e6 * y),
@@ -153,8 +150,8 @@ def test_the_only_view_asks_for_the_pose_before_the_joints():
         (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of those of the marks"),
         (
             lambda x, y: (1e3 * y, 1e3 * x),
-            "they are in mm and x and y are exchanged; publish joint "
-            "positions in metres, and exchange joint_x and joint_y",
+            "they are in mm and x and y are exchanged; publish joint positions in "
+            "metres, and exchange joint_x and joint_y",
         ),
     ],
 )
@@ -421,9 +418,9 @@ def test_a_clock_of_its_own(ahead_s, side):
     cell.samples = [replace(s, stamp_ns=s.stamp_ns - shift) for s in cell.samples]
     assert findings(cell.events) == {
         None: (
-            "25 of 25 detections were rejected as "
-            "no_encoder_sample_near: the detections are stamped "
-            f"about {abs(ahead_s):g} s {side} the encoder samples; stamp both by one clock"
+            "25 of 25 detections were rejected as no_encoder_sample_near: the "
+            f"detections are stamped about {abs(ahead_s):g} s {side} the encoder "
+            "samples; stamp both by one clock"
         )
     }
 
@@ -438,8 +435,8 @@ def test_commands_by_another_clock(ahead_s, side):
     ]
     found = findings(cell.events)[None]
     assert found.startswith(
-        "25 of 25 detections were rejected as outside_every_view: all "
-        f"detections are stamped {side} view command, about 37 s off; sync"
+        "25 of 25 detections were rejected as outside_every_view: all detections are "
+        f"stamped {side} view command, about 37 s off; sync"
     )
 
 

@@ -21,9 +21,9 @@ def test_a_name_that_nobody_knows():
     with pytest.raises(InputError) as caught:
         ModelTerm("creep")
     assert str(caught.value) == (
-        "model: the term 'creep' is unknown; known are microscope, "
-        "drift, plate_scale, plate_shape, approach, plate_strain, "
-        "line_eccentricity, line_scale, rotation, yaw"
+        "model: the term 'creep' is unknown; known are microscope, drift, plate_scale, "
+        "plate_shape, approach, plate_strain, line_eccentricity, line_scale, rotation, "
+        "yaw"
     )
 
 

@@ -96,8 +96,8 @@ def test_marks_have_no_sites_between_quarter_turns():
         (
             View("v", 0.0, (0.005, 0.0)),
             PLATE,
-            "view 'v' translation: 0.5 is not a whole number of pitch "
-            "steps; place the plate on the",
+            "view 'v' translation: 0.5 is not a whole number of pitch steps; place "
+            "the plate on the",
         ),
         (
             View("v", 0.0, (math.nan, 0.0)),
@@ -122,8 +122,8 @@ def test_marks_have_no_sites_between_quarter_turns():
         (
             View("v", math.radians(15)),
             PLATE,
-            "view 'v': grid marks cannot be measured at a turn of 15 "
-            "deg; turn by 90 deg, set grid to",
+            "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by 90 "
+            "deg, set grid to",
         ),
         (
             View("v", math.radians(7), grid=False),
@@ -133,8 +133,8 @@ def test_marks_have_no_sites_between_quarter_turns():
         (
             View("v", math.radians(15), grid=False),
             Artifact(11, 0.01),
-            "view 'v': a turn that is not a quarter needs angular lines; "
-            "turn by a multiple of 90 deg",
+            "view 'v': a turn that is not a quarter needs angular lines; turn by a "
+            "multiple of 90 deg",
         ),
     ],
 )
@@ -300,8 +300,8 @@ def test_a_plate_without_angular_count_has_no_lines():
         ),
         (
             plan_with({"rotation": 90}),
-            "f: views[0]: rotation: unknown key; did you mean "
-            "'rotation_deg'? known are name, rotation_",
+            "f: views[0]: rotation: unknown key; did you mean 'rotation_deg'? known "
+            "are name, rotation_",
         ),
         (
             plan_with({"rotation_deg": "90"}),
@@ -317,8 +317,8 @@ def test_a_plate_without_angular_count_has_no_lines():
         ),
         (
             plan_with({"rotation_deg": 1, "angular": True}),
-            "view 'a' rotation: 0.0666667 is not a whole "
-            "number of angular line steps; turn by whole lines, or set angular to false",
+            "view 'a' rotation: 0.0666667 is not a whole number of angular line "
+            "steps; turn by whole lines, or set angular to false",
         ),
         (
             plan_with({"rotation_deg": 1, "grid": False}),
@@ -338,8 +338,8 @@ def test_a_plate_without_angular_count_has_no_lines():
         ),
         (
             plan_with({"translation_pitch": [0.5, 0], "grid": False}),
-            "view 'a' translation: 0.5 is not a whole number of pitch "
-            "steps; place the plate on the latt",
+            "view 'a' translation: 0.5 is not a whole number of pitch steps; place "
+            "the plate on the latt",
         ),
         (
             plan_with({"translation_pitch": [2e5, 0]}),
@@ -408,9 +408,8 @@ def test_a_plate_without_angular_count_has_no_lines():
                 **plan_with({"angular": True}),
                 "artifact": {**PLAN["artifact"], "angular_count": 0},
             },
-            "f: views[0]: angular marks are wanted but the plate has "
-            "none; set angular to false, or "
-            "give the plate its angular_count",
+            "f: views[0]: angular marks are wanted but the plate has none; set "
+            "angular to false, or give the plate its angular_count",
         ),
     ],
 )
@@ -543,13 +542,13 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
         ),
         (
             {"marks": 5, "offset": 0.00251},
-            "f: view 'a' check_stops: 0.00251 m is more than a quarter "
-            "of the pitch; stop at most 0.0025 m off the mark; 20e-6 is usual",
+            "f: view 'a' check_stops: 0.00251 m is more than a quarter of the pitch; "
+            "stop at most 0.0025 m off the mark; 20e-6 is usual",
         ),
         (
             {"marks": 12, "offset": 2e-5},
-            "f: view 'a' check_stops: 12 marks are requested, 11 lie in "
-            "the field; ask for fewer marks",
+            "f: view 'a' check_stops: 12 marks are requested, 11 lie in the field; "
+            "ask for fewer marks",
         ),
     ],
 )

@@ -290,9 +290,8 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
     [
         (
             [],
-            "has images and no detections: options: pixel_size and "
-            "mark_size: are not set; give them "
-            "in m; `selfcal camera init` finds the size of a pixel",
+            "has images and no detections: options: pixel_size and mark_size: are not "
+            "set; give them in m; `selfcal camera init` finds the size of a pixel",
         ),
         (
             ["--pixel-size", "6e-6"],

@@ -223,10 +223,10 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
         (
             Level.ERROR,
             (
-                "bag_player: /measurement_collector does not listen to stage/joint_states, "
-                "stage/mark_detections, selfcal/view_command after 0.2 s, "
-                "nothing was played; start it, "
-                "name another node as listener, or set listener to '' to play without waiting"
+                "bag_player: /measurement_collector does not listen to "
+                "stage/joint_states, stage/mark_detections, selfcal/view_command after "
+                "0.2 s, nothing was played; start it, name another node as listener, "
+                "or set listener to '' to play without waiting"
             ),
         )
     ]
@@ -375,8 +375,8 @@ def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(
     assert lines == [
         (
             Level.ERROR,
-            f"{bag}: {total} messages when it was opened, 1 now; play a bag "
-            "that is not being changed",
+            f"{bag}: {total} messages when it was opened, 1 now; play a bag that is "
+            "not being changed",
         )
     ]
 

@@ -549,8 +549,8 @@ def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     assert status == GoalStatus.STATUS_ABORTED
     assert (result.error_code, result.map_path) == (4, "")
     assert result.message == (
-        "run_calibration: the solver has not saved the map in 0.1 s; check "
-        "the solver, then call save_map"
+        "run_calibration: the solver has not saved the map in 0.1 s; check the solver, "
+        "then call save_map"
     )
 
 

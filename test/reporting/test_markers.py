@@ -41,8 +41,8 @@ def test_a_vector_points_from_the_nominal_site_along_the_error():
         heads[site] - tails[site], [[6e-3, -8e-3, 0.0]], rtol=1e-12
     )
     assert shape.legend == (
-        "stage error (indicated - true), enlarged 20,000 x, longest 0.5 um; "
-        "dark: u = 0.005 um (k=1)"
+        "stage error (indicated - true), enlarged 20,000 x, longest 0.5 um; dark: u = "
+        "0.005 um (k=1)"
     )
     assert shape.legend_at[1] < shape.sites[:, 1].min()
 

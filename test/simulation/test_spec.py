@@ -268,10 +268,9 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
         ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
         (
             {"plan": PLAN, "sed": 1},
-            ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
-            "physics, placed, noise, cell, faults, camera, correction, "
-            "seed, noise_seed, start_time, "
-            "compression",
+            ": sed: unknown key; did you mean 'seed'? known are plan, truth, physics, "
+            "placed, noise, cell, faults, camera, correction, seed, noise_seed, "
+            "start_time, compression",
         ),
         (
             {"plan": {**PLAN, "views": []}},
@@ -291,9 +290,8 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
         ),
         (
             {"plan": PLAN, "noise": {"encoder_rate": 500}},
-            ": noise: encoder_rate: unknown key; known "
-            "are sigma_xy, sigma_theta, noise_ratio, visit_xy, image_xy, "
-            "flicker_xy, flicker_theta, "
+            ": noise: encoder_rate: unknown key; known are sigma_xy, sigma_theta, "
+            "noise_ratio, visit_xy, image_xy, flicker_xy, flicker_theta, "
             "resolution_xy, resolution_theta",
         ),
         (
@@ -306,26 +304,24 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
         ),
         (
             {"plan": PLAN, "placed": [{"name": "b", "turn": 90}]},
-            ": placed: views[0]: turn: unknown "
-            "key; known are name, rotation_deg, translation_pitch, translation_mm, grid, angular, "
-            "repeats, visit_order",
+            ": placed: views[0]: turn: unknown key; known are name, rotation_deg, "
+            "translation_pitch, translation_mm, grid, angular, repeats, visit_order",
         ),
         (
             {"plan": PLAN, "cell": {"visit_order": "spiral"}},
-            ": simulated cell: visit_order: 'spiral' "
-            "is not a visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
-            "x_back_y_back, random, if need be with @plate",
+            ": simulated cell: visit_order: 'spiral' is not a visiting order; use one "
+            "of raster, serpentine, there_and_back, x_then_y, x_back_y_back, random, "
+            "if need be with @plate",
         ),
         (
             {"plan": PLAN, "cell": {"encoder_rate": 100}},
-            ": simulated cell: 100 Hz gives fewer than 2.5 "
-            "encoder samples in a dwell of 0.006 s; raise encoder_rate or exposure_period",
+            ": simulated cell: 100 Hz gives fewer than 2.5 encoder samples in a dwell "
+            "of 0.006 s; raise encoder_rate or exposure_period",
         ),
         (
             {"plan": PLAN, "faults": {"lost": 0.6, "duplicated": 0.6}},
-            ": faults: the parts of the "
-            "detections add up to 1.2; keep the sum at 1 or below: a "
-            "detection has one fault at most",
+            ": faults: the parts of the detections add up to 1.2; keep the sum at 1 "
+            "or below: a detection has one fault at most",
         ),
         (
             {"plan": PLAN, "faults": {"delay": 0.6, "delay_s": 0.6}},

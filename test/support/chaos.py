@@ -156,9 +156,9 @@ class Story:
                 "the undisturbed run",
             )
         return (
-            f"{sent} detections = {used} used + {rejected} rejected; {max(destroyed, 0)} lost "
-            f"before, {named_missing(progress)} named as missing; "
-            f"killed {', '.join(node for _, node in self.kills)}"
+            f"{sent} detections = {used} used + {rejected} rejected; "
+            f"{max(destroyed, 0)} lost before, {named_missing(progress)} named as "
+            f"missing; killed {', '.join(node for _, node in self.kills)}"
         )
 
     def _refused(self, message: str, measurements: object) -> str:

@@ -85,8 +85,8 @@ def row(name: str, found: Summary, advised: Summary | None = None) -> str:
     cause = found.causes[0][0] if found.causes else "–"
     after = grades(advised) if advised else ""
     text = (
-        f"| {shown(name)} | {within_xy}, {within_theta} | "
-        f"{found.z_xy:.2f}, {found.z_theta:.2f} | {grades(found)} | {after} | {cause} |"
+        f"| {shown(name)} | {within_xy}, {within_theta} | {found.z_xy:.2f}, "
+        f"{found.z_theta:.2f} | {grades(found)} | {after} | {cause} |"
     )
     return text.replace("nan ± nan", "–").replace("nan", "–")
 

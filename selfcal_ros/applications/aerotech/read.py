@@ -171,8 +171,8 @@ class _Reader:
             if kind is not self.open.kind:
                 self.findings.error(
                     line,
-                    f"a {kind.start} line in the {self.open.kind} table of "
-                    f"line {self.open.heads[0][0]}",
+                    f"a {kind.start} line in the {self.open.kind} table of line "
+                    f"{self.open.heads[0][0]}",
                     f"start every line of its head with {self.open.kind.start}",
                 )
                 self.open.broken = self.open.broken_head = True

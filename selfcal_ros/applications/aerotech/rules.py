@@ -237,8 +237,8 @@ def _gi4(table: Table2D, findings: CalFindings, gi4: Gi4) -> None:
     if unit.word is not UnitWord.COUNTS:
         findings.warning(
             table.lines.get("pos_unit", table.line),
-            f"sample distances in {unit.word} cannot be compared with the "
-            f"{want:.9g} counts that a GI4 needs",
+            f"sample distances in {unit.word} cannot be compared with the {want:.9g} "
+            "counts that a GI4 needs",
             "give them in counts",
         )
         return
@@ -292,8 +292,8 @@ def check_counts(tables: Sequence[Table], findings: CalFindings) -> None:
                 if axis in scanners:
                     findings.error(
                         table.line,
-                        "a second table for the galvo scanner of axis "
-                        f"{axis}, after that of line {scanners[axis]}",
+                        f"a second table for the galvo scanner of axis {axis}, after "
+                        f"that of line {scanners[axis]}",
                         "keep one table for each scanner",
                     )
                     break

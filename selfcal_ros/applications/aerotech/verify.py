@@ -176,8 +176,8 @@ def verify_tables(
             raise InputError(
                 f"the table of line {table.line}",
                 f"it corrects {list(table.outputs)} from the positions of {list(table.inputs)}",
-                f"name the axes of the stage (now x={frame.x_axis}, "
-                f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})",
+                f"name the axes of the stage (now x={frame.x_axis}, y={frame.y_axis}, "
+                f"theta={frame.theta_axis or 'none'})",
             )
     sites = between = lines = one_axis = entries = None
     in_one_axis = [table for table in xy if isinstance(table, Table1D)]
@@ -332,9 +332,9 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     header = ("error", "rms before", "after", "largest before", "after", "unit")
     figure = CaptionedFigure(
         controller_figure(verification),
-        "A simulated controller moves to the nodes and to the middle of every "
-        "cell, without and with the exported table. What remains between the "
-        "nodes is the controller's linear interpolation.",
+        "A simulated controller moves to the nodes and to the middle of every cell, "
+        "without and with the exported table. What remains between the nodes is the "
+        "controller's linear interpolation.",
     )
     leaves = Section(
         "What the table leaves",

@@ -416,7 +416,7 @@ def identify(data: StepDiagonal, choice: Choice) -> StepDiagonalResult:
         raise InputError(
             "readings",
             EQUAL_READINGS,
-            "turn the mirror square to the laser, or "
-            "allow equal readings if the linear errors truly are the same",
+            "turn the mirror square to the laser, or allow equal readings if the "
+            "linear errors truly are the same",
         )
     return identify_ibaraki(data, form=choice.form)

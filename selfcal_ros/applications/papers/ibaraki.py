@@ -133,9 +133,9 @@ def ibaraki_text(reproduction: IbarakiReproduction) -> str:
     return "\n".join(
         [
             *lines,
-            "The readings are not published. Ours are of a simulated "
-            "machine with the measured errors, "
-            f"10 nm of noise and mirrors {MIRROR_RAD * URAD_PER_RAD:g} urad off,",
+            "The readings are not published. Ours are of a simulated machine with the "
+            "measured errors, 10 nm of noise and mirrors "
+            f"{MIRROR_RAD * URAD_PER_RAD:g} urad off,",
             "which explains the published positions of the conventional formulation.",
         ]
     )

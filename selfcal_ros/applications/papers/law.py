@@ -402,8 +402,8 @@ def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
     if datum is ThetaDatum.XY_AXES and artifact.grid_size % 2 == 0:
         raise InputError(
             "method law",
-            f"no marks of {artifact.grid_size} rows lie on the axes, "
-            "which have no slope (Hu eq. 27)",
+            f"no marks of {artifact.grid_size} rows lie on the axes, which have no "
+            "slope (Hu eq. 27)",
             "use the theta datum zero_mean",
         )
     if datum is ThetaDatum.XY_AXES and artifact.grid_size < 5:

@@ -319,8 +319,8 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
             ""
             if not program.deficiency
             else (
-                " by the generalised inverse; `solve` refuses "
-                f"({program.deficiency} modes undetermined)"
+                f" by the generalised inverse; `solve` refuses ({program.deficiency} "
+                "modes undetermined)"
             )
         )
         lines.append(

@@ -588,8 +588,8 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
         raise InputError(
             "--covariance",
             f"{int(has_u.sum())} nodes",
-            "omit it: U of distances is "
-            f"given; the covariance is written for up to {MAX_COVARIANCE} nodes",
+            "omit it: U of distances is given; the covariance is written for up to "
+            f"{MAX_COVARIANCE} nodes",
         )
     full = stage.covariance(plate.x_m[has_u], plate.y_m[has_u])
     columns = (

@@ -90,8 +90,8 @@ def _require_temperature(
                 "certificate",
                 f"{item['name']} is {item['value']:g} °C, but the reference length "
                 f"was converted to {used:g} °C (u {u:g} K)",
-                "correct the condition, or solve "
-                "again with the temperature of the measurement in --reference-at",
+                "correct the condition, or solve again with the temperature of the "
+                "measurement in --reference-at",
             )
 
 

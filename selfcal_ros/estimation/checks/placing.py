@@ -542,15 +542,15 @@ def placing_error(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingE
     if isinstance(pose_fault, Mirrored):
         return PlacingError(
             f"{where}all views",
-            "the plate turns and shifts as in a mirrored "
-            f"frame: stage and offsets have {', or '.join(pose_fault.axes)}",
+            "the plate turns and shifts as in a mirrored frame: stage and offsets "
+            f"have {', or '.join(pose_fault.axes)}",
             "correct the axes of both, so that a plate turned counter-clockwise "
             "turns from +x to +y",
         )
     if pose_fault.found_deg != pose_fault.planned_deg:
         fault = (
-            f"the plate lies turned by {pose_fault.found_deg:g}°, "
-            f"not by {pose_fault.planned_deg:g}°"
+            f"the plate lies turned by {pose_fault.found_deg:g}°, not by "
+            f"{pose_fault.planned_deg:g}°"
         )
         wrong_way = (pose_fault.found_deg + pose_fault.planned_deg) % 360 == 0
         how = "turn it counter-clockwise" if wrong_way else "turn it as planned"

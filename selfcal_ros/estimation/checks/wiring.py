@@ -471,9 +471,9 @@ def turned_error(measurements: Measurements, wirings: Sequence[Turned]) -> Wirin
     return WiringError(
         f"plan '{measurements.plan_id}', stage/mark_detections",
         f"{texts}: only so do the readings of all views agree",
-        "publish mark - optical axis along the stage's axes (a "
-        "camera: --turn and --mirror, `selfcal camera init` finds them); check_stops in the plan "
-        "show it in the first view",
+        "publish mark - optical axis along the stage's axes (a camera: --turn and "
+        "--mirror, `selfcal camera init` finds them); check_stops in the plan show it "
+        "in the first view",
     )
 
 

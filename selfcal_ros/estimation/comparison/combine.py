@@ -129,8 +129,8 @@ def require_own_readings(
                 ):
                     raise InputError(
                         member.name,
-                        f"of the opposite sign to {members[first].name}: its "
-                        "negative agrees, and it does not",
+                        f"of the opposite sign to {members[first].name}: its negative "
+                        "agrees, and it does not",
                         "give G = indicated - true",
                     )
             for earlier in range(index if kind == "xy" else 0):

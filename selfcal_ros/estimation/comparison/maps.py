@@ -397,8 +397,8 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
     if abs(a.grid_pitch_m - b.grid_pitch_m) > GAP * a.grid_pitch_m:
         raise InputError(
             f"{names[0]} and {names[1]}",
-            "the lattices differ: pitches of "
-            f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",
+            f"the lattices differ: pitches of {a.grid_pitch_m * MM_PER_M:.9g} and "
+            f"{b.grid_pitch_m * MM_PER_M:.9g} mm",
             "compare maps of the same plate",
         )
 

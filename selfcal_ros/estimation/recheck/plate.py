@@ -163,8 +163,8 @@ def reference_now(
         raise InputError(
             "--reference-at",
             f"{where} has no reference length of its plate with the temperature of the calibration",
-            "leave it out: the map then has no "
-            "scale; or calibrate with --reference and --reference-at",
+            "leave it out: the map then has no scale; or calibrate with --reference "
+            "and --reference-at",
         )
     certified = before.certified
     now = replace(

@@ -407,8 +407,7 @@ def _require_visits(inputs: TermInputs, name: str) -> None:
         if visits is None:
             raise InputError(
                 f"view '{view}'",
-                f"the term '{name}' needs the time, the offset and "
-                "the direction of approach of each reading, and the readings do not "
-                "contain them",
+                f"the term '{name}' needs the time, the offset and the direction of "
+                "approach of each reading, and the readings do not contain them",
                 "solve from the bag, or leave the term out",
             )

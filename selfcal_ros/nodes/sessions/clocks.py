@@ -116,8 +116,8 @@ class ClockWatch:
         side = "ahead of" if offset > 0 else "behind"
         return Diagnosis(
             Level.WARN,
-            f"the cell's clock is {abs(offset) * S_PER_NS:.3g} s {side} "
-            "this machine's: detections fall into wrong views; synchronise the clocks "
+            f"the cell's clock is {abs(offset) * S_PER_NS:.3g} s {side} this "
+            "machine's: detections fall into wrong views; synchronise the clocks "
             "(PTP, NTP)",
             values,
         )

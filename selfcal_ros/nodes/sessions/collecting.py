@@ -210,8 +210,8 @@ class CollectingSession:
             self.missed[view] = name = command.placed().name
             self._ports.say(
                 Level.WARN,
-                f"view '{name}' began before this node: earlier "
-                "detections are missing here; redo_view measures it again",
+                f"view '{name}' began before this node: earlier detections are "
+                "missing here; redo_view measures it again",
             )
 
     def tick(self) -> None:
@@ -412,8 +412,7 @@ class CollectingSession:
             if index is None
             else (
                 f"view '{progress[index].view.name}': "
-                f"{100 * progress[index].coverage:.0f} % of the "
-                "readings taken"
+                f"{100 * progress[index].coverage:.0f} % of the readings taken"
             )
         )
 

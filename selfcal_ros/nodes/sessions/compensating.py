@@ -583,9 +583,9 @@ def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
     ):
         raise InputError(
             f"the map of {source}",
-            "its non-orthogonality and scale difference are "
-            f"{fits[0]:.4g} and {fits[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: "
-            "axes were exchanged or reversed, or numbers changed, after it was solved",
+            f"its non-orthogonality and scale difference are {fits[0]:.4g} and "
+            f"{fits[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: axes were "
+            "exchanged or reversed, or numbers changed, after it was solved",
             "publish the map as the solver does",
         )
 

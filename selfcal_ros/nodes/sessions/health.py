@@ -181,8 +181,8 @@ class Losses(Tally):
             self._tell(
                 topic,
                 total,
-                f"{topic}: {new} messages were lost in transport; the machine "
-                "or the network is too slow for them",
+                f"{topic}: {new} messages were lost in transport; the machine or the "
+                "network is too slow for them",
                 f"{topic}: {total} messages lost",
             )
 
@@ -401,8 +401,8 @@ def missing_marks(status: Any) -> str:
     ]
     parts += (
         [
-            f"check stops of {checks} mark{'s' * (checks != 1)} "
-            "(see check_marks of the view command)"
+            f"check stops of {checks} mark{'s' * (checks != 1)} (see check_marks of "
+            "the view command)"
         ]
         if checks > 0
         else []

@@ -214,8 +214,8 @@ class SequencingSession:
             if not self._strayed:
                 self._ports.say(
                     Level.WARN,
-                    "another publisher sends view commands that begin no "
-                    "run later than this one: not followed; find who sends them",
+                    "another publisher sends view commands that begin no run later "
+                    "than this one: not followed; find who sends them",
                 )
             self._strayed = True
             return
@@ -276,8 +276,8 @@ class SequencingSession:
         elif not self._set_back:
             self._set_back = (
                 f"this machine's clock is {behind_s:.3g} s behind its own last "
-                "command: it was set back, and what is detected until it has "
-                "caught up counts in an earlier view; wait, then redo_view"
+                "command: it was set back, and what is detected until it has caught up "
+                "counts in an earlier view; wait, then redo_view"
             )
             self._ports.say(Level.WARN, self._set_back)
 

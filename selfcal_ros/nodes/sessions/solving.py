@@ -300,8 +300,8 @@ class SolvingSession:
                 if begun_ns(run.run_id) is None:
                     raise InputError(
                         MEASUREMENT_TOPIC,
-                        "readings without a run_id, while "
-                        f"run {self._run.run_id} is known: not used",
+                        f"readings without a run_id, while run {self._run.run_id} is "
+                        "known: not used",
                         "set run_id in the commands, or restart the solver",
                     )
                 self._left_aside += 1

@@ -188,8 +188,8 @@ def measurement_section(result: CalibrationResult) -> Section:
         ),
         (
             "identifiable",
-            f"{'yes' if observability.identifiable else 'NO'} "
-            f"(rank {observability.rank} of {observability.unknowns} unknowns, "
+            f"{'yes' if observability.identifiable else 'NO'} (rank "
+            f"{observability.rank} of {observability.unknowns} unknowns, "
             f"{counted(observability.deficiency, 'undetermined mode')})",
         ),
     ]

@@ -271,8 +271,8 @@ def _clearest(of: LargestChange) -> str:
 def recheck_lines(recheck: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
     out = [
-        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, "
-        f"u {recheck.u_rms * UM_PER_M:.5f} µm, p = {recheck.p_xy:.2g}"
+        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, u "
+        f"{recheck.u_rms * UM_PER_M:.5f} µm, p = {recheck.p_xy:.2g}"
     ]
     if (sizes := recheck.detectable) is not None:
         out.append(
@@ -281,9 +281,8 @@ def recheck_lines(recheck: Recheck) -> list[str]:
         )
     if (turn := recheck.largest_theta) is not None:
         out.append(
-            f"theta  clearest at line {turn.line}: "
-            f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
-            f"arcsec (k=1), p = {recheck.p_theta:.2g}"
+            f"theta  clearest at line {turn.line}: {turn.change * ARCSEC_PER_RAD:+.4f} "
+            f"± {turn.u * ARCSEC_PER_RAD:.4f} arcsec (k=1), p = {recheck.p_theta:.2g}"
         )
     if recheck.passes == 1:
         out.append(ONE_PASS)
@@ -303,20 +302,20 @@ def changed_text(finding: Changed) -> str:
 def changed_or_drifted_text(finding: ChangedOrDrifted) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
     return (
-        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
-        f"(p = {finding.p:.2g}); {ONE_PASS}"
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} (p = "
+        f"{finding.p:.2g}); {ONE_PASS}"
     )
 
 
 def changed_or_microscope_text(finding: ChangedOrMicroscope) -> str:
     """Return the reason why a change that a microscope explains too is not qualified."""
     return (
-        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
-        f"(p = {finding.p:.2g}); a changed stage, or a microscope with a scale wrong by "
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} (p = "
+        f"{finding.p:.2g}); a changed stage, or a microscope with a scale wrong by "
         f"{finding.scale:+.1%} ± {finding.u_scale:.1%} and turned by "
-        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad (k=1) "
-        "explains it alike: measure check stops (check_stops in the plan), or correct the "
-        "pixel size"
+        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} "
+        "mrad (k=1) explains it alike: measure check stops (check_stops in the plan), "
+        "or correct the pixel size"
     )
 
 

@@ -67,8 +67,8 @@ def validation_text(held_out: list[HeldOut], artifact: Artifact) -> list[str]:
         if item.n_grid:
             predictions.append(
                 f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} µm "
-                f"rms, {item.max_m * UM_PER_M:.4g} µm at most "
-                f"({item.ratio:.2f} times the noise{_limit_text(item, why)})"
+                f"rms, {item.max_m * UM_PER_M:.4g} µm at most ({item.ratio:.2f} times "
+                f"the noise{_limit_text(item, why)})"
             )
         if item.n_angular:
             predictions.append(

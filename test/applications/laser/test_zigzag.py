@@ -193,8 +193,8 @@ def test_runs_over_different_places_are_refused():
         (
             lambda s: replace(s, laser_m=s.laser_m * 1000),
             InputError,
-            "run pp, x move, block 1: 7067.64 where 7.07107 mm is "
-            "nominal, 999.5 times as much; check --laser-unit and --step-x, --step-y",
+            "run pp, x move, block 1: 7067.64 where 7.07107 mm is nominal, 999.5 "
+            "times as much; check --laser-unit and --step-x, --step-y",
         ),
     ],
 )

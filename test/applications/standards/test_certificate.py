@@ -670,8 +670,8 @@ def changed(value, *path):
         ),
         (
             changed("2026-11-20", "certificate", "issued"),
-            "certificate.issued: 2026-11-20 is before the end of the "
-            "measurement, 2026-11-21; correct",
+            "certificate.issued: 2026-11-20 is before the end of the measurement, "
+            "2026-11-21; correct",
         ),
         (
             changed("2026-11-20", "equipment", 0, "valid_until"),

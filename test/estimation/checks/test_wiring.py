@@ -398,8 +398,8 @@ def test_the_error_says_what_and_how_to_correct_it_in_one_line():
             solve(readings, Options())
         text = str(error.value)
         assert text.startswith(
-            "plan '0, 90, tx', stage/mark_detections: offsets of the other "
-            "sign: offset_x and offset_y rise where the optical axis moves on"
+            "plan '0, 90, tx', stage/mark_detections: offsets of the other sign: "
+            "offset_x and offset_y rise where the optical axis moves on"
         )
         assert text.endswith(
             "mark - optical axis: reverse the sign of offset_x and offset_y; or, "

@@ -101,8 +101,8 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(
         ),
         (
             "plate_scale,drift:1e-8",
-            "model drift, plate_scale: the fit does not converge; leave a "
-            "term out, or give plate_scale a size",
+            "model drift, plate_scale: the fit does not converge; leave a term out, "
+            "or give plate_scale a size",
         ),
         (
             "plate_scale:1e-7,drift:1e-8",

@@ -364,8 +364,8 @@ def test_half_axes_that_are_not_known_as_a_whole_are_refused():
     with pytest.raises(InputError) as caught:
         calibrate(readings, axes)
     assert str(caught.value) == (
-        "theta datum xy_axes: the half axis along +x has one site, which "
-        "gives no slope; measure what is missing there, or use zero_mean"
+        "theta datum xy_axes: the half axis along +x has one site, which gives no "
+        "slope; measure what is missing there, or use zero_mean"
     )
     _, readings = measured(hu_plan(Artifact(7, 0.01, 24)))
     end = replace(

@@ -356,8 +356,8 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
         calibrate(readings, BARE)
     error = with_advice(refusal.value)
     assert str(error).startswith(
-        "the marks that were read do not identify the stage (2 modes "
-        "undetermined): add a view turned by 90 deg; or add a view "
+        "the marks that were read do not identify the stage (2 modes undetermined): "
+        "add a view turned by 90 deg; or add a view "
     )
     assert [mode.name for mode in error.observability.modes] == [
         "nonorthogonality",

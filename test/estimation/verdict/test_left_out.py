@@ -46,9 +46,8 @@ def left_out(result):
             0,
             0,
             {"too_far_from_nominal": 50, "low_score": 2},
-            "is not part of the map: none of its detections became a "
-            "reading (too_far_from_nominal 50, "
-            "low_score 2)",
+            "is not part of the map: none of its detections became a reading "
+            "(too_far_from_nominal 50, low_score 2)",
         ),
         (0, 0, {}, "is not part of the map: nothing was detected in it"),
         (

@@ -156,8 +156,8 @@ def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(
     desk.reception.command(b"\0\1\0\0" + b"\xff" * 40, False)
     assert desk.receive(events).read() == expected
     assert desk.refused == {
-        f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
-        f"{ENCODER_TOPIC}; 1 messages on {DETECTION_TOPIC}: cannot be "
+        f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on {ENCODER_TOPIC}; 1 "
+        f"messages on {DETECTION_TOPIC}: cannot be "
         "decoded; correct their publisher": 1
     }
 
@@ -452,9 +452,8 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(
     told = desk.reception.diagnosis()
     assert (told.level, told.values["journal_lost"]) == (Level.WARN, 30)
     assert told.message == (
-        f"{desk.keeper.path}: the journal cannot be written (No space left on "
-        "device); free some space or name another folder; 30 messages are not "
-        "in the journal"
+        f"{desk.keeper.path}: the journal cannot be written (No space left on device); "
+        "free some space or name another folder; 30 messages are not in the journal"
     )
     disk.full = False
     desk.hands.pass_time(10)
@@ -557,8 +556,8 @@ class Locked:
     [
         (
             InputError("journal_1", "another process writes this journal", "end it"),
-            "journal_1: another process writes this journal; end it; 90 "
-            "messages are not in the journal",
+            "journal_1: another process writes this journal; end it; 90 messages are "
+            "not in the journal",
             {},
         ),
         (

@@ -507,9 +507,8 @@ def test_truth_with_unknown_sites():
         ({}, "truth gx: missing; give gx, gy (m) and g_theta (rad)"),
         (
             {"gx": np.zeros((3, 3)), "gy": np.zeros((5, 5))},
-            "truth gx: has the shape (3, 3), the map has (5, 5); give "
-            "the truth on the lattice of the "
-            "map",
+            "truth gx: has the shape (3, 3), the map has (5, 5); give the truth on "
+            "the lattice of the map",
         ),
         (
             {"gx": [[1], [2, 3]], "gy": 0},
@@ -567,7 +566,7 @@ def test_symbols_only_where_the_stream_has_them():
 
 def test_summary_does_not_load_matplotlib():
     code = (
-        "import sys, selfcal_ros.reporting.summary.sections; "
-        "sys.exit('matplotlib' in sys.modules)"
+        "import sys, selfcal_ros.reporting.summary.sections; sys.exit('matplotlib' in "
+        "sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

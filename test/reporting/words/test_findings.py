@@ -128,8 +128,8 @@ def strained(part, size):
         *(
             (
                 microscope(0, 0, sign * 1e-3, 0),
-                f"a microscope that shows lengths along x {what} than "
-                f"along y by 0.2000 ± 0.0020 %: {ALIGN}",
+                f"a microscope that shows lengths along x {what} than along y by "
+                f"0.2000 ± 0.0020 %: {ALIGN}",
                 sign * 1e-3,
                 1e-5,
                 "m/m",
@@ -151,17 +151,16 @@ def strained(part, size):
                 [1e-9, 0, 0, 25.6e-9],
                 1e-9,
             ),
-            "a drift of 0.0512 ± 0.0020 µm along y during view "
-            "'+x': visit the marks there and back",
+            "a drift of 0.0512 ± 0.0020 µm along y during view '+x': visit the marks "
+            "there and back",
             51.2e-9,
             2e-9,
             "m",
         ),
         (
             explanation("plate_scale", [(1, ""), (2, "")], [1e-7, -2e-6], 1e-7),
-            "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in "
-            "view '0': let the plate reach "
-            "thermal equilibrium",
+            "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in view '0': let "
+            "the plate reach thermal equilibrium",
             -2e-6,
             1e-7,
             "m/m",
@@ -202,9 +201,8 @@ def strained(part, size):
         ),
         (
             explanation("plate_shape", [(1, "x x2"), (1, "y x2")], [3e-8, 0], 1.5e-9),
-            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
-            "in view '90' relative to view "
-            f"'0': {CLAMP}",
+            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' "
+            f"relative to view '0': {CLAMP}",
             3e-8,
             1.5e-9,
             "m",
@@ -213,9 +211,9 @@ def strained(part, size):
             explanation(
                 "plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, determined=False
             ),
-            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
-            "in view '90' relative to view "
-            f"'0', part of which cannot be separated from the stage: {CLAMP}",
+            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' "
+            "relative to view '0', part of which cannot be separated from the stage: "
+            f"{CLAMP}",
             -3e-8,
             1.5e-9,
             "m",
@@ -236,9 +234,9 @@ def strained(part, size):
                 [1e-7, 0, 3e-6, -4e-6],
                 1e-7,
             ),
-            "a circle of lines off the axis of rotation by 5.00 ± 0.10 "
-            "µrad of its radius in view '90': "
-            "centre the circle of lines on the axis of rotation in each view",
+            "a circle of lines off the axis of rotation by 5.00 ± 0.10 µrad of its "
+            "radius in view '90': centre the circle of lines on the axis of rotation "
+            "in each view",
             5e-6,
             1e-7,
             "rad",
@@ -252,9 +250,8 @@ def strained(part, size):
                 1e-8,
                 share_before=0.4,
             ),
-            "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
-            "about 40% of view '90': measure the "
-            "view again, or solve with --robust",
+            "a plate that slipped by (0.3, -0.4) µm and 1 µrad after about 40% of "
+            "view '90': measure the view again, or solve with --robust",
             5e-7,
             1e-8,
             "m",
@@ -263,9 +260,8 @@ def strained(part, size):
             explanation(
                 "reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)
             ),
-            "a reading of mark (-2, 5) in view '+x' that is off by 0.500 "
-            "± 0.010 µm: solve with --robust, "
-            "or measure it again",
+            "a reading of mark (-2, 5) in view '+x' that is off by 0.500 ± 0.010 µm: "
+            "solve with --robust, or measure it again",
             5e-7,
             1e-8,
             "m",
@@ -306,18 +302,16 @@ CAUSES = [
     *(
         (
             replace(SCALE, name="line_scale", size=size),
-            f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a "
-            "microscope that shows lengths too "
-            f"{other} by as much: {COMPARE}",
+            f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a microscope that "
+            f"shows lengths too {other} by as much: {COMPARE}",
         )
         for size, how, other in ((0.06, "small", "long"), (-0.06, "large", "short"))
     ),
     *(
         (
             replace(SCALE, size=size),
-            f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, "
-            "or offsets of the lines too "
-            f"{other} by as much: {ALIGN}",
+            f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, or offsets "
+            f"of the lines too {other} by as much: {ALIGN}",
         )
         for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))
     ),
@@ -331,9 +325,8 @@ CAUSES = [
             view="90",
             mark=(7,),
         ),
-        "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 "
-        "arcsec: solve with --robust, or "
-        "measure it again",
+        "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 arcsec: solve "
+        "with --robust, or measure it again",
     ),
     *(
         (
@@ -431,16 +424,14 @@ FINDINGS = [
     ),
     (
         NoiseUnknown(),
-        "grid readings: neither repeats nor residuals determine the "
-        "noise, so the uncertainty is not "
-        "known; read every mark twice",
+        "grid readings: neither repeats nor residuals determine the noise, so the "
+        "uncertainty is not known; read every mark twice",
     ),
     (
         FiniteRotation(size=5.126e-3, unit="rad", residuals=2.04e-8),
         "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
-        "--misalignment linear (or --method law); solved jointly "
-        "with finite rotations, the default, "
-        "the readings leave 0.0204 µm",
+        "--misalignment linear (or --method law); solved jointly with finite "
+        "rotations, the default, the readings leave 0.0204 µm",
     ),
     (
         AxesNotMet(size=3 * ARCSEC_RAD, unit="rad", p=0.0012),
@@ -466,10 +457,10 @@ FINDINGS = [
     ),
     (
         unchecked([(m, 5) for m in range(7)], [4, 11]),
-        "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) "
-        "and 2 lines (4, 11) of the map "
-        "rest on single readings that no other checks; an error in them goes into the map, and no "
-        "residual shows it: measure the missing marks, or add a view",
+        "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) and 2 lines (4, "
+        "11) of the map rest on single readings that no other checks; an error in "
+        "them goes into the map, and no residual shows it: measure the missing marks, "
+        "or add a view",
     ),
     (
         unchecked([], [4]),
@@ -479,20 +470,18 @@ FINDINGS = [
     *(
         (
             Magnification(size=sign * 2e-3, u=1e-5, unit="m/m"),
-            f"the encoders indicate the plate {word} than nominal by 2000 ± 10 "
-            "µm/m, more than plate and "
-            "encoders should differ: check the pitch in the plan "
-            "(grid_pitch), and the scale of the "
-            "encoders",
+            f"the encoders indicate the plate {word} than nominal by 2000 ± 10 µm/m, "
+            "more than plate and encoders should differ: check the pitch in the plan "
+            "(grid_pitch), and the scale of the encoders",
         )
         for sign, word in ((1, "larger"), (-1, "smaller"))
     ),
     *(
         (
             ReferenceOff(size=sign * 2e-3, u=1e-5, unit="m/m"),
-            "by the reference length the encoders indicate lengths "
-            f"{word} than they are by 2000 ± 10 µm/m, more than encoders should: check its "
-            "error and the unit of that (relative, not µm/m), and the pitch in the plan "
+            f"by the reference length the encoders indicate lengths {word} than they "
+            "are by 2000 ± 10 µm/m, more than encoders should: check its error and "
+            "the unit of that (relative, not µm/m), and the pitch in the plan "
             "(grid_pitch)",
         )
         for sign, word in ((1, "longer"), (-1, "shorter"))
@@ -507,8 +496,8 @@ FINDINGS = [
     ),
     (
         outliers(3, [("90", "grid", (0, -2), 5.04), ("90", "grid", (1, -2), 6.04)]),
-        "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' "
-        "grid (1, -2) (6.0 sigma) and 1 more",
+        "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' grid (1, -2) (6.0 "
+        "sigma) and 1 more",
     ),
     (
         outliers(1, [("90", "grid", (0, -2), 5.04)]),
@@ -541,15 +530,15 @@ FINDINGS = [
     ),
     (
         slip([("90", "m", 2), ("+x", "n", 0)], spoils=False, y=0.0, phi=0.0),
-        "view '90': the plate slipped by about (0.3, 0) µm and 0 "
-        "µrad, before m = 2 or before n = 0 "
-        "in view '+x'; the readings do not determine which; the view is left out",
+        "view '90': the plate slipped by about (0.3, 0) µm and 0 µrad, before m = 2 "
+        "or before n = 0 in view '+x'; the readings do not determine which; the view "
+        "is left out",
     ),
     (
         slip([("90", "m", 2), ("90", "n", 0)], spoils=True),
-        "view '90': the plate slipped by about (0.3, -0.4) µm and 5 "
-        "µrad, before m = 2 or before n = "
-        "0; the readings do not determine which; this spoils the map: measure the view again",
+        "view '90': the plate slipped by about (0.3, -0.4) µm and 5 µrad, before m = "
+        "2 or before n = 0; the readings do not determine which; this spoils the map: "
+        "measure the view again",
     ),
     (
         TakenForSlip(
@@ -705,8 +694,8 @@ def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
         Verdict(Grade.NOT_QUALIFIED, (unknown,), (TURN, drift)), TESTED
     )
     assert found.sentence == (
-        "Not qualified: most likely a microscope turned counter-clockwise by "
-        f"2.000 ± 0.010 mrad: {ALIGN}"
+        "Not qualified: most likely a microscope turned counter-clockwise by 2.000 ± "
+        f"0.010 mrad: {ALIGN}"
     )
     assert found.reasons == (
         sentence_of(unknown),
