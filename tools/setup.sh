@@ -16,8 +16,8 @@ suitable() {  # runs, and is a version for which the ROS 2 wheels exist and the 
 
 find_python() {
   local candidate
-  for candidate in "${PYTHON:-}" python3.12 "$HOME"/.pyenv/versions/3.12.*/bin/python \
-                   python3.13 "$HOME"/.pyenv/versions/3.13.*/bin/python python3; do
+  for candidate in "${PYTHON:-}" python3.12 "${HOME:-}"/.pyenv/versions/3.12.*/bin/python \
+                   python3.13 "${HOME:-}"/.pyenv/versions/3.13.*/bin/python python3; do
     if [ -n "$candidate" ] && suitable "$candidate"; then echo "$candidate"; return; fi
   done
   return 1

@@ -446,7 +446,7 @@ class Visitor:
 
     def _check_left_alone(self, motion: Position) -> None:
         """Raise if the position at rest has changed by more than the tolerance of arrival."""
-        axis = self._farthest(motion)
+        axis = self._farthest(motion, "arrival")
         if abs(motion[axis]) > self.cell.settle.of(axis, "arrival"):
             raise MachineError(
                 f"{axis} has changed by {_length_text(axis, motion[axis])} at rest, "
@@ -462,12 +462,12 @@ class Visitor:
             for axis in self.axes
         )
 
-    def _farthest(self, away: Position) -> str:
-        """Return the axis that is farthest off, in units of its tolerance of arrival."""
+    def _farthest(self, away: Position, tolerance: str) -> str:
+        """Return the axis that is farthest off, in units of its own tolerance."""
         return max(
             away,
             key=lambda axis: (
-                abs(away[axis]) / max(self.cell.settle.of(axis, "arrival"), TINY)
+                abs(away[axis]) / max(self.cell.settle.of(axis, tolerance), TINY)
             ),
         )
 
@@ -543,12 +543,7 @@ class Visitor:
     def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
         self._check_axes(before, now)
         motion = _difference(before, now)
-        axis = max(
-            self.axes,
-            key=lambda name: (
-                abs(motion[name]) / max(self.cell.settle.of(name, "within"), TINY)
-            ),
-        )
+        axis = self._farthest(motion, "within")
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
             f"by {_length_text(axis, motion[axis])}",
@@ -575,7 +570,7 @@ class Visitor:
             if goal[axis] != start[axis]
             and (abs(value) > self.cell.settle.of(axis, "arrival"))
         }
-        axis = self._farthest(moving or away)
+        axis = self._farthest(moving or away, "arrival")
         cross_axis = {"x": "y", "y": "x"}.get(axis, "")
         indicated = goal[axis] + away[axis]
         step = goal[axis] - start[axis]
@@ -620,7 +615,7 @@ class Visitor:
                 return before, detections, after
             self._check_axes(before, after)
             self._check_left_alone(motion)
-        axis = max(self.axes, key=lambda name: abs(motion[name]))
+        axis = self._farthest(motion, "within")
         raise MachineError(
             f"{axis} moved by {_length_text(axis, motion[axis])} during {TRIES} exposures",
             "machine",

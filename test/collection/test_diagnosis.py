@@ -440,6 +440,19 @@ def test_commands_by_another_clock(ahead_s, side):
     )
 
 
+def test_the_clock_of_what_lies_between_the_commands_is_not_doubted():
+    """All was exposed while the plate was placed for the second view."""
+    cell = scene("0, 90", count=0)
+    _, _, begin, end, _ = (command.stamp_ns for command in cell.commands)
+    cell.detections = [
+        replace(d, stamp_ns=begin + 1 + at) for at, d in enumerate(cell.detections)
+    ]
+    assert cell.detections[-1].stamp_ns < end
+    found = str(findings(cell.events)[None])
+    assert "rejected as outside_every_view" in found
+    assert "view command" not in found
+
+
 def test_an_encoder_that_sends_too_seldom():
     cell = scene(count=0, exposure_period_s=0.2)
     cell.samples = cell.samples[::75]

@@ -194,3 +194,14 @@ def test_a_quarter_turn_of_mixed_sides_is_half_a_pitch_beside():
         "add a view turned by 90 deg and shifted by +0.5 pitch along X and +0.5 pitch along Y"
     )
     assert check_plan(mixed_plan("0, 90, tx", 8, 5)).observability.identifiable
+
+
+@pytest.mark.parametrize("size", [(7, 6), (6, 7)])
+def test_the_axis_conditions_need_sites_on_both_axes(size):
+    _, readings = measured(
+        mixed_plan("0, 90, 180, tx, ty", *size, count=8, line=True), 1
+    )
+    with pytest.raises(
+        InputError, match=f"no sites of {size[0]} x {size[1]} lie on the axes"
+    ):
+        calibrate(readings, Options(datum_theta=ThetaDatum.XY_AXES))

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from selfcal_ros.collection.inputs import Command, Detection, Phase
+from selfcal_ros.collection.inputs import Command, Detection, Kind, Phase
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
@@ -197,3 +197,5 @@ def test_a_class_of_ones_own_tells_the_same_without_ros_and_by_the_driver(tmp_pa
         driver.close()
     assert driven == alone
     assert len(alone) == 264
+    lines = [line for line, _ in alone if line.kind == Kind.ANGULAR]
+    assert {(line.offset_x, line.offset_y) for line in lines} == {(0.0, 0.0)}

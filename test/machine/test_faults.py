@@ -101,6 +101,7 @@ OF_THE_STAGE = [
     ("ends short", "x was sent to .*, -100 um away"),
     ("never at rest", "x (does not come to rest|moved by)"),
     ("creeps at rest", "y (does not come to rest|moved by)"),
+    ("sways", "x moved by -?3 um during 3 exposures"),
     ("replies of another axis", "it answers for the other axis"),
     ("zero lost at rest", "x has changed by 3000 um at rest, without a command"),
     ("moved by hand", "y has changed by 50 um at rest, without a command"),
@@ -150,6 +151,16 @@ def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
     )
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     assert sum(int(view.count.sum()) for view in readings.views) >= 8
+
+
+def test_of_axes_that_do_not_rest_the_one_farthest_beyond_its_tolerance_is_named(
+    tmp_path,
+):
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(
+        MachineError, match="x does not come to rest in 1 s: two readings differ by -?3"
+    ):
+        run_of(tmp_path, Spoilt(machine, "sways"), cell).measure()
 
 
 @pytest.mark.parametrize(

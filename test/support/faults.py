@@ -53,6 +53,12 @@ def _creeping(spoilt, at):
     return _with(at, 1, at[1] + 2e-6 * spoilt.n)
 
 
+def _swaying(spoilt, at):
+    """Three times the tolerance of x, twice that of theta."""
+    spoilt.n += 1
+    return np.add(at, np.array([3e-6, 0.0, 2e-5]) * (-1) ** spoilt.n / 2)
+
+
 def _other_order(spoilt, at):
     spoilt.n += 1
     return at[[1, 0, 2]] if spoilt.n % 2 else at
@@ -70,6 +76,7 @@ POSITIONS: dict[str, Callable] = {
     "position one reading old": _one_reading_old,
     "never at rest": _oscillating,
     "creeps at rest": _creeping,
+    "sways": _swaying,
     "replies of another axis": _other_order,
     "position in mm": lambda _, at: at * [1e3, 1e3, 1.0],
     "position in um": lambda _, at: at * [1e6, 1e6, 1.0],

@@ -255,6 +255,11 @@ BROKEN = [
         "axis_index: '1.5' is not a whole number",
     ),
     (":START 1 SAMPLEDIST=1\n:END\n", 1, "the table has no correction values"),
+    (
+        ":START 1 SAMPLEDIST=1\n:START POSUNIT=COUNTS\n:END\n",
+        2,
+        "the table has no correction values",
+    ),
     (":START 1 SAMPLEDIST=1\n0\n1,5\n:END\n", 3, "'1,5' is not a number"),
     (":START 1 SAMPLEDIST=1\n0\nnan\n:END\n", 3, "'nan' is not a number"),
     (":START 1 SAMPLEDIST=1\n0\n1 inf\n:END\n", 3, "'inf' is not a number"),

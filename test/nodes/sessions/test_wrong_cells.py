@@ -5,6 +5,7 @@ Each wrong cell fails; the first line names its fault, and what follows from it 
 """
 
 import tracemalloc
+from dataclasses import replace
 from itertools import islice
 from types import SimpleNamespace
 
@@ -548,3 +549,30 @@ def test_faults_that_have_nothing_to_do_with_each_other_stand_side_by_side():
         ("signs", "ids"),
         ("theta", ""),
     ]
+
+
+def test_a_clock_that_is_set_back_leaves_the_commands_in_their_order():
+    """A cell takes a command for old that is stamped before the last one."""
+    hands = Hands()
+    check = CellCheck(
+        small_plan(),
+        settings_of("measurement_collector"),
+        replace(hands.ports, now_ns=lambda: hands.now_ns - set_back_ns),
+        settle_s=0.2,
+        patience_s=1.0,
+    )
+    cell = Cell("", hands)
+    cell.check, set_back_ns, stamps_ns = check, 0, []
+    begun_ns = hands.now_ns
+    while not check.done:
+        hands.published.clear()
+        check.tick()
+        for command in hands.of("command"):
+            stamp = command["header"]["stamp"]
+            stamps_ns.append(stamp["sec"] * 10**9 + stamp["nanosec"])
+            set_back_ns = 60 * 10**9
+        cell.tick()
+        hands.pass_time(TICK_S)
+    assert begun_ns <= stamps_ns[0] < begun_ns + 60 * 10**9
+    assert stamps_ns == list(range(stamps_ns[0], stamps_ns[-1] + 1))
+    assert len(stamps_ns) > 2
