@@ -87,28 +87,35 @@ def checked():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_commands_run(page, desk, solved, checked, capsys):
+    """In their order, as a reader runs them: a file is written before it is named, and once."""
     text = page.read_text()
-    for name, content in (found for kind in FILES for found in kind.findall(text)):
-        (desk / name).write_text(content)
+    files = sorted(
+        (found for kind in FILES for found in kind.finditer(text)), key=re.Match.start
+    )
     run = [
         (command, code) for command, code in commands(text) if not parsed_alone(command)
     ]
-    if any("RESULT.json" in command for command, _ in run):
+    if "RESULT.json" in text and "-o RESULT.json" not in text:
         copyfile(solved, "RESULT.json")
+    at = 0
     for command, code in run:
+        at = text.index(command, at)
+        while files and files[0].end() <= at:
+            file = files.pop(0)
+            (desk / file[1]).write_text(file[2])
         if (command, code) in checked:
             continue
         if command.startswith("selfcal plan check config/"):
             checked.add((command, code))
         words = shlex.split(command)
-        if "-o" in words:  # one of two ways to write the same file
-            written = desk / words[words.index("-o") + 1]
-            if not written.is_dir():
-                written.unlink(missing_ok=True)
-            written.parent.mkdir(exist_ok=True)  # the page says mkdir
+        if "-o" in words:  # the page says mkdir
+            (desk / words[words.index("-o") + 1]).parent.mkdir(exist_ok=True)
         found = main(words[1:])
-        error = capsys.readouterr().err
-        assert found == code, f"{page.name}: {command}: {error}"
+        printed = capsys.readouterr()
+        assert found == code, f"{page.name}: {command}: {printed.err}"
+        shown = text[at + len(command) :].lstrip("\n").splitlines()[0]
+        if shown.startswith("{"):
+            assert printed.out.strip() == shown, f"{page.name}: {command}"
 
 
 def test_the_way_to_a_corrected_machine_is_whole():
