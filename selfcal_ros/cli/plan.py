@@ -322,18 +322,15 @@ def _check_text(
     lines += [
         _known_text(plan, unknown),
         *_unchecked_text(observability),
+        _check_stops_text(plan),
+        *([] if artifact.map_grid else [NODES_ONLY]),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}",
     ]
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
-    return [
-        *lines,
-        *([f"  ({note})"] if note else []),
-        _check_stops_text(plan),
-        *([] if artifact.map_grid else [NODES_ONLY]),
-    ]
+    return [*lines, *([f"  ({note})"] if note else [])]
 
 
 def _rank_text(observability: Observability) -> str:

@@ -32,7 +32,7 @@ from selfcal_ros.estimation.observability.suggest import (
 )
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.files import yaml_text
-from selfcal_ros.machine.cell import PLACERS, SHIPPED
+from selfcal_ros.machine.cell import PLACERS, SHIPPED, known_machines
 from selfcal_ros.machine.visiting import stops
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -177,8 +177,8 @@ QUESTIONS = (
     ),
     Question(
         "machine",
-        f"what is driven: {', '.join(SHIPPED)}",
-        _one_of(*SHIPPED),
+        f"what is driven: {', '.join(SHIPPED)}, or another package's",
+        lambda text, option: _one_of(*known_machines())(text, option),
         "simulated",
     ),
 )
@@ -457,7 +457,7 @@ def _cell_text(answers: Known, simulation: str) -> str:
     machine_keys = (
         f"{{simulation: {simulation}}}"
         if answers.machine == "simulated"
-        else f"{OWN_KEYS[answers.machine]}  # edit these"
+        else f"{OWN_KEYS.get(answers.machine, '{}')}  # edit these"
     )
     x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in answers.travel)
     theta = ", theta: [-7.0, 7.0]" if answers.lines else ""
@@ -532,7 +532,8 @@ def _text(
     )
     for view in plan.views:
         kind = "" if view.grid else ", lines only"
-        yield f"  {view.name}: {describe_view(view, artifact)}, {view.repeats} times{kind}"
+        how_often = "once" if view.repeats == 1 else f"{view.repeats} times"
+        yield f"  {view.name}: {describe_view(view, artifact)}, {how_often}{kind}"
     noise = Assumed()
     yield (
         f"it identifies the stage: U of XY {2 * budget.u_rms('xy') * UM_PER_M:.3g} µm (k = 2, "
@@ -545,7 +546,7 @@ def _text(
     longer = minutes_of(answers, replace(plan, views=(further,)))
     yield (
         f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
-        f"{1 - factor:.0%} smaller and takes {longer:.0f} minutes more"
+        f"{100 * (1 - factor):.0f} % smaller and takes {longer:.0f} minutes more"
     )
     yield f"written: {', '.join(map(str, outputs))}"
     tried = "" if answers.machine == "simulated" else f"selfcal cell try {outputs[1]}; "

@@ -22,8 +22,9 @@ from selfcal_ros.model.terms import (
     parse_terms,
 )
 from selfcal_ros.model.view import DEFAULT_ORDER, Plan, parse_order
+from selfcal_ros.reporting.words.findings import MRAD, unit_of
 from selfcal_ros.reporting.words.tables import removal_text
-from selfcal_ros.units import M_PER, MRAD_PER_RAD, RAD_PER, UM_PER_M
+from selfcal_ros.units import M_PER, RAD_PER, UM_PER_M
 
 SIGMA = "20e-9"
 SIGMA_THETA = "3.6arcsec"
@@ -324,11 +325,11 @@ def _modes(number: int) -> str:
 
 def size_text(check: TermCheck) -> str:
     """Return the size of a term in a person's unit."""
-    if check.unit == "m":
-        return f"{check.size * UM_PER_M:.6g} µm"
-    if block_of(check.name).of_plate:
-        return f"{check.size * UM_PER_M:.6g} µm/m"
-    return f"{check.size * MRAD_PER_RAD:.6g} mrad"
+    is_turn = block_of(
+        check.name
+    ).of_microscope  # as large as its scale, and shown for it
+    unit = MRAD if is_turn else unit_of(check.name, check.unit)
+    return f"{check.size * unit.per_si:.6g} {unit.name}"
 
 
 def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:

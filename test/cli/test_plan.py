@@ -746,3 +746,18 @@ def test_a_size_of_0_takes_a_default_term_out_of_the_predicted_u(capsys):
             line["component"] for line in lines if line["quantity"] == "xy"
         }
     assert components["5e-9"] - components["0"] == {"plate_shape"}
+
+
+def test_the_predictions_stand_together_below_their_heading(capsys):
+    options = ["--model", "drift,plate_shape:30e-9", "--sigma", "20nm"]
+    assert main(["plan", "check", shipped("hu_repeated"), *options]) == 0
+    head, _, text = capsys.readouterr().out.partition("predicted standard uncertainty,")
+    assert "check stops: 5 marks" in head and "every reading lies at a node" in head
+    _, *predicted = text.partition("predicted uncertainty budget")[0].splitlines()
+    assert [line.split(" rms ")[0].strip() for line in predicted] == [
+        "XY",
+        "theta",
+        "XY",
+        "XY with drift, plate_shape:3e-08:",
+        "XY with drift, plate_shape:3e-08:",
+    ]

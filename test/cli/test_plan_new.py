@@ -122,6 +122,21 @@ def test_the_cell_of_every_machine_can_be_read(machine):
     )
 
 
+def test_a_machine_of_another_package_has_its_cell(tmp_path, monkeypatch):
+    folder = tmp_path / "my_package-1.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\n")
+    (folder / "entry_points.txt").write_text(
+        "[selfcal.machines]\nbench = my_package:Bench\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert new(*STAGE, "--minutes", "30", "--machine", "bench") == 0
+    assert (read_cell("cell.yaml").machine, read_yaml("cell.yaml")["bench"]) == (
+        "bench",
+        {},
+    )
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [

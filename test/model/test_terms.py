@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.terms import ModelTerm, microscope_term, parse_terms
@@ -21,9 +22,7 @@ def test_a_name_that_nobody_knows():
     with pytest.raises(InputError) as caught:
         ModelTerm("creep")
     assert str(caught.value) == (
-        "model: the term 'creep' is unknown; known are microscope, drift, plate_scale, "
-        "plate_shape, approach, plate_strain, line_eccentricity, line_scale, rotation, "
-        "yaw"
+        f"model: the term 'creep' is unknown; known are {', '.join(BUILT_IN)}"
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
@@ -567,9 +568,8 @@ def test_terms_of_a_plan_are_read_and_checked():
     for terms, message in (
         (
             ["creep"],
-            "here: model_terms: the term 'creep' is unknown; known are microscope, "
-            "drift, plate_scale, plate_shape, approach, plate_strain, line_eccentricity, "
-            "line_scale, rotation, yaw",
+            "here: model_terms: the term 'creep' is unknown; known are "
+            + ", ".join(BUILT_IN),
         ),
         (
             [{"drift": 1e-9}],
