@@ -512,10 +512,10 @@ def _verify(args: argparse.Namespace) -> int:
             size("after") / size("before") for size in (residual.rms, residual.largest)
         )
         tell(
-            f"{args.leaf.prog}: {cal.where}: the tables leave {rms_left:.0%} of the error at the "
-            f"{residual.place}, {peak_left:.0%} of the largest, more than the U of the map: they "
-            "are not those of this map; check offset, unit and number of rows, or export "
-            "them again",
+            f"{args.leaf.prog}: {cal.where}: the tables leave {100 * rms_left:.0f} % of the "
+            f"error at the {residual.place}, {100 * peak_left:.0f} % of the largest, more than the "
+            "U of the map: they are not those of this map; check offset, unit and number of rows, "
+            "or export them again",
             sys.stderr,
         )
     return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)

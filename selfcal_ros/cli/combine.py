@@ -16,6 +16,7 @@ from selfcal_ros.files import read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import CalibrationResult, created_now, result_to_dict
 from selfcal_ros.outputs import check_outputs, write_json
+from selfcal_ros.reporting.summary.numbers import p_text
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
@@ -89,14 +90,14 @@ def _text(result: CalibrationResult, figures: dict[str, Any]) -> str:
         f"mean of {len(figures['runs'])} maps: {result.verdict.sentence}",
         f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
         f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {figures['u_between_m'] * UM_PER_M:.3g} "
-        f"µm rms, p = {figures['p_between']:.2g}",
+        f"µm rms, {p_text(figures['p_between'])}",
     ]
     if "u_between_rad" in figures:
         lines.append(
-            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} "
-            f"arcsec rms (k = {noise.k_theta:.3g}), between runs "
-            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, p = "
-            f"{figures['p_between_theta']:.2g}"
+            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
+            f"rms (k = {noise.k_theta:.3g}), between runs "
+            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
+            f"{p_text(figures['p_between_theta'])}"
         )
     lines.append("each map against the mean of the others:")
     for run in figures["runs"]:
@@ -109,7 +110,7 @@ def _text(result: CalibrationResult, figures: dict[str, Any]) -> str:
 
 
 def _p(p: float | None) -> str:
-    return "" if p is None else f", p = {p:.2g}"
+    return "" if p is None else f", {p_text(p)}"
 
 
 def _run_text(run: dict[str, Any]) -> str:

@@ -23,6 +23,7 @@ from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.figures.maps import difference_picture
+from selfcal_ros.reporting.summary.numbers import p_text
 from selfcal_ros.reporting.summary.sections import enlargement_texts
 from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
@@ -227,8 +228,8 @@ def _test_text(test: Significance | None) -> list[str]:
     doubt = "" if test.correlated else "; correlations between nodes unknown"
     return [
         f"       Mahalanobis distance^2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, "
-        f"p = {test.p:.2g}{doubt}",
-        f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, p = {test.p_z:.2g}",
+        f"{p_text(test.p)}{doubt}",
+        f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, {p_text(test.p_z)}",
     ]
 
 
@@ -264,7 +265,7 @@ def _laser_text(rows: Sequence[LaserDifference]) -> str:
     for row in rows:
         unit = "µrad" if row.name == "nonorthogonality" else "µm/m"
         test = (
-            "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, p = {row.p:.2g}"
+            "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, {p_text(row.p)}"
         )
         lines.append(
             f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "

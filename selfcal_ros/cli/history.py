@@ -7,14 +7,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from selfcal_ros.applications.batch.history import Drift, Entry, drift_from, history
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference
 from selfcal_ros.estimation.comparison.verification import require_correctable
 from selfcal_ros.outputs import plain, write_text
+from selfcal_ros.reporting.summary.numbers import map_figures
 from selfcal_ros.results import ACTIVE, active_map, read_result
 from selfcal_ros.units import NM_PER_M, UM_PER_M
 
@@ -143,8 +142,7 @@ def _drift_text(drift: Drift | None) -> str:
 
 
 def _largest_m(entry: Entry) -> float:
-    emap = entry.result.error_map
-    return float(np.nanmax(np.abs([emap.gx, emap.gy])))
+    return map_figures(entry.result.error_map).max_error_m
 
 
 def _entry_json(entry: Entry) -> dict[str, Any]:

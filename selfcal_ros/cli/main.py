@@ -46,6 +46,17 @@ NUMBERS = {
     "float": "a number; give it without a unit, with a decimal point",
     "int": "a whole number",
 }
+EXTRAS = {
+    "cv2": "camera",
+    "distributed": "dask",
+    "ezdxf": "plate",
+    "gdstk": "plate",
+    "ophyd": "ophyd",
+    "pymmcore": "micromanager",
+    "serial": "gcode",
+    "weasyprint": "pdf",
+}
+"""Modules that are imported where they are used, and the extra that installs each."""
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
@@ -112,7 +123,7 @@ def _verb_in(words: Iterable[str]) -> str:
 
 
 def _complete() -> None:
-    """Answer a shell's request for completions and end; see README."""
+    """Answer a shell's request for completions and end; see docs/index.md."""
     import argcomplete  # for completion only
 
     # without the word at the cursor
@@ -193,7 +204,12 @@ def _remedy(module: str | None) -> str:
     """Return what to do about a module that is missing."""
     if module in sys.stdlib_module_names:
         return "this needs Linux: verbs that work on bags and results run everywhere"
-    return "install it, see README"
+    from selfcal_ros.start import NEEDED  # reads the definitions of the messages
+
+    extra = EXTRAS.get(module or "")
+    return NEEDED.get(module or "") or (
+        f"pip install 'selfcal_ros[{extra}]'" if extra else f"pip install {module}"
+    )
 
 
 class Parser(argparse.ArgumentParser):

@@ -27,7 +27,7 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
-from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.errors import InputError, NotIdentifiableError, printable
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.options import Options
@@ -309,10 +309,7 @@ def run(args: argparse.Namespace) -> int:
         result, lines = _validated(args, measurements, options, result)
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
-    if args.report:
-        from selfcal_ros.reporting.report import write_report  # loads every figure
-
-        write_report(result, args.report, truth=read_truth(args.bag))
+    lines = [*_report(args, result), *lines]
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
         lines += _since(result)
@@ -384,6 +381,16 @@ def _validated(
             *(f"  {line}" for line in validation_text(validation, result.plate)),
         ]
     return result, lines
+
+
+def _report(args: argparse.Namespace, result: CalibrationResult) -> list[str]:
+    """Write the report, if one is wanted, and return the line that names it."""
+    if not args.report:
+        return []
+    from selfcal_ros.reporting.report import write_report  # loads every figure
+
+    write_report(result, args.report, truth=read_truth(args.bag))
+    return [f"report: {printable(args.report)}"]
 
 
 def _since(result: CalibrationResult) -> list[str]:

@@ -281,8 +281,8 @@ def _simulate(args: argparse.Namespace) -> int:
         write_json(args.truth, truth_of(simulation.machine))
     if args.output:
         write_text(args.output, text)
-    if args.json or not args.output:
-        say(args, text.removesuffix("\n"), {"csv": text, "file": args.output})
+    shown = f"written: {args.output}" if args.output else text.removesuffix("\n")
+    say(args, shown, {"csv": text, "file": args.output})
     return ExitCode.DONE
 
 
@@ -306,8 +306,8 @@ def _measurement(args: argparse.Namespace) -> tuple:
                 "min_rest",
                 "settle",
             ),
-            f"it is for bags, and {args.data} is a table",
-            "omit it",
+            f"it is for bags, and {args.data} is not one",
+            "name a bag, or omit it",
         )
         dim = dimension_of(args.data)
         columns = RequiredColumns(

@@ -187,7 +187,7 @@ def _similar(
     if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
         raise InputError(
             "images",
-            f"the image of the motion is sheared by {sheared:.1%}",
+            f"the image of the motion is sheared by {100 * sheared:.1f} %",
             "check that the moves are shorter than half the distance of two marks, "
             "and that the encoder axes are those of the camera's stage",
         )

@@ -213,7 +213,7 @@ def test_a_theta_table_that_does_nothing_does_not_pass(run, tmp_path):
     assert run("verify", "r.json", "f_theta.cal")[0] == 0
     code, _, err = run("verify", "r.json", "bad.cal")
     assert code == 5
-    one_line(err, "bad.cal: the tables leave 100% of the error at the lines")
+    one_line(err, "bad.cal: the tables leave 100 % of the error at the lines")
 
 
 def test_theta_goes_into_a_file_of_its_own(run):

@@ -10,7 +10,7 @@ from importlib import metadata
 
 import pytest
 
-from selfcal_ros.cli.main import build_parser, main
+from selfcal_ros.cli.main import EXTRAS, build_parser, main
 from selfcal_ros.cli.verbs import EXAMPLES, GROUPS, START_HERE, VERBS, Verb, module_of
 from test.support.sources import ROOT
 from test.support.terminals import SELFCAL, in_terminal
@@ -193,3 +193,29 @@ def test_every_verb_is_in_a_group():
     assert all(
         isinstance(verb, Verb) and verb.group in GROUPS for verb in VERBS.values()
     )
+
+
+def test_a_module_that_is_missing_is_named_with_the_extra_that_installs_it(
+    monkeypatch, capsys
+):
+    """Each extra of setup.py has one, but that of the tests."""
+    declared = (ROOT / "setup.py").read_text().partition("extras_require={")[2]
+    extras = set(re.findall(r'^ +"(\w+)": \[', declared.partition("},")[0], re.M))
+    assert set(EXTRAS.values()) == extras - {"test"}
+
+    def lacks(name):
+        raise ModuleNotFoundError(name=name)
+
+    for module, remedy in (
+        ("pymmcore", "pip install 'selfcal_ros[micromanager]'"),
+        ("vendor", "pip install vendor"),
+        (
+            "rclpy",
+            "source a ROS 2 installation, or use the environment of `make setup`",
+        ),
+    ):
+        monkeypatch.setattr("selfcal_ros.cli.table.run", lambda _, it=module: lacks(it))
+        assert main(["table", "RESULT.json", "-o", "x.csv"]) == 2
+        assert capsys.readouterr().err == (
+            f"selfcal table: there is no module {module} in this environment; {remedy}\n"
+        )

@@ -69,6 +69,8 @@ def test_calibrations_are_listed_in_the_order_of_their_measurement(folder, capsy
         str(folder / "a.json"),
     ]
     first, second = found["entries"]
+    emap = read_result(str(folder / "a.json")).error_map
+    assert second["largest_m"] == np.hypot(emap.gx, emap.gy).max()
     assert first["not_compared"] is None and found["active"] is None
     assert second["changed"]
     # nothing but a shift is removed from it

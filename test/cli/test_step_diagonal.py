@@ -413,6 +413,12 @@ def test_bag_options_are_checked(tmp_path, capsys, extra, message):
     assert code == 2 and message in err and err.count("\n") == 1
 
 
+def test_a_bag_that_is_not_there_is_not_called_a_table(capsys):
+    code, _, err = run(capsys, "BAG", "--method", "new", "--laser-topic", "/laser")
+    assert code == 2
+    assert "--laser-topic: it is for bags, and BAG is not one; name a bag" in err
+
+
 def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
     bag = recorded_bag(tmp_path / "bag")
     topics = ("--laser-topic", "cell/laser", "--position-topic", "cell/axes")

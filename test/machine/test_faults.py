@@ -158,7 +158,8 @@ def test_of_axes_that_do_not_rest_the_one_farthest_beyond_its_tolerance_is_named
 ):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(
-        MachineError, match="x does not come to rest in 1 s: two readings differ by -?3"
+        MachineError,
+        match=r"x does not come to rest in 1 s: two readings differ by -?3",
     ):
         run_of(tmp_path, Spoilt(machine, "sways"), cell).measure()
 

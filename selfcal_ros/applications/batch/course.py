@@ -19,6 +19,7 @@ from selfcal_ros.applications.batch.folder import Record
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.summary.numbers import p_text
 from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
@@ -336,7 +337,7 @@ def sentence(records: Sequence[Record], where: str) -> str:
     tested = [record for record in records if record.get("baseline")]
     changed = [record for record in tested if record["baseline"]["changed"]]
     named = ", ".join(
-        f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})"
+        f"{record['bag']} ({p_text(record['baseline']['adjusted_p'])})"
         for record in changed
     )
     reasons = Counter(

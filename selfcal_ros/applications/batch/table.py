@@ -12,6 +12,7 @@ import numpy as np
 
 from selfcal_ros.applications.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.applications.batch.folder import PER, SCHEMA, Record
+from selfcal_ros.reporting.summary.numbers import counted, p_text
 
 S_PER_DAY = 86400.0
 BASE = (
@@ -65,7 +66,7 @@ class PlanHistory:
 
     def _sentence(self, name: str, course: Course) -> str:
         text, unit = described(name)
-        p = f"p = {course.adjusted_p:.2g}"
+        p = p_text(course.adjusted_p)
         if course.finding is CourseKind.TREND:
             slope, low, high = course.slope_per_day
             return (
@@ -230,14 +231,14 @@ def summary_lines(
     good = sum(record["exit_code"] == 0 for record in records)
     maps = good + sum(record["exit_code"] == 5 for record in records)
     lines = [
-        f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
+        f"{counted(len(records), 'bag')}: {maps} calibrated, {good} of them qualified, "
         f"{len(records) - maps} without a result; {done_before} were done before"
     ]
     for series in histories:
         sentences = series.sentences()
         lines.append(
-            f"plan {series.plan_id}, {len(series.records)} bags from {series.date(0)} to "
-            f"{series.date(-1)}:"
+            f"plan {series.plan_id}, {counted(len(series.records), 'bag')} from "
+            f"{series.date(0)} to {series.date(-1)}:"
         )
         few = f"too few bags for a trend (fewer than {FEWEST})"
         nothing = (

@@ -20,7 +20,14 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, titled
-from selfcal_ros.units import M_PER_MM, MM_PER_M, MRAD_PER_RAD, UM_PER_M, UM_PER_MM
+from selfcal_ros.reporting.summary.numbers import counted
+from selfcal_ros.units import (
+    M_PER_MM,
+    MM_PER_M,
+    MRAD_PER_RAD,
+    UM_PER_M,
+    UM_PER_MM,
+)
 
 SCHEMA = "selfcal.step_diagonal/1"
 CONVENTION = {
@@ -243,7 +250,7 @@ def summary(result: dict[str, Any]) -> str:
         ]
     lines = [
         f"{result['method']} formulation, {result['n_blocks']} blocks, "
-        f"{len(result['diagonals'])} diagonals, {result['n_repeats']} repeat(s)"
+        f"{len(result['diagonals'])} diagonals, {counted(result['n_repeats'], 'repeat')}"
     ]
     lines += [
         f"  {key:22s} {in_um(result[key], result.get(f'u_{key}'))}" for key in names

@@ -99,6 +99,13 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
+def p_text(p: float | None, digits: int = 2) -> str:
+    """Return ``p = 0.72``; a probability too small for a float is not 0. None is unknown."""
+    if p is None:
+        return f"p = {UNKNOWN}"
+    return f"p = {p:.{digits}g}" if p else "p < 1e-300"
+
+
 def numeric_columns(table: Sequence[Sequence[str]]) -> list[bool]:
     """Return which columns of a table contain only numbers below the header."""
     return [
@@ -472,9 +479,9 @@ def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
         )
     )
     significance = (
-        f"p = {yaw_map.p:.1g}"
+        p_text(yaw_map.p, 1)
         if yaw_map.p < TURNS
-        else f"not more than its noise, p = {yaw_map.p:.2g}"
+        else f"not more than its noise, {p_text(yaw_map.p)}"
     )
     return (
         (

@@ -32,6 +32,7 @@ from selfcal_ros.reporting.summary.numbers import (
     fixed_column,
     map_figures,
     numeric_columns,
+    p_text,
     significant,
     truth_figures,
     um,
@@ -75,7 +76,7 @@ def verdict_section(result: CalibrationResult) -> Section:
     verdict = result.verdict
     notes = list(verdict.reasons)
     notes += [
-        f"likely cause: {cause.text} (p = {cause.p:.1g})" for cause in verdict.causes
+        f"likely cause: {cause.text} ({p_text(cause.p, 1)})" for cause in verdict.causes
     ]
     return Section(_TITLES[verdict.grade], notes=(*notes, *enlargement_texts(verdict)))
 

@@ -55,6 +55,7 @@ from selfcal_ros.model.findings import (
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.reporting.summary.numbers import p_text
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -203,7 +204,7 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
     "slip": lambda c: (
         "a plate that slipped by "
         f"{_slipped(c.details['x'], c.details['y'], c.details['phi'])} after about "
-        f"{c.details['after']:.0%} of view '{c.view}'"
+        f"{100 * c.details['after']:.0f} % of view '{c.view}'"
     ),
     "rotation": lambda c: (
         f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
@@ -372,7 +373,7 @@ def _(finding: NoiseContradicted) -> str:
 def _(finding: AxesNotMet) -> str:
     return (
         "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
-        f"{finding.size * ARCSEC_PER_RAD:.3g} arcsec, p = {finding.p:.2g}); use zero_mean"
+        f"{finding.size * ARCSEC_PER_RAD:.3g} arcsec, {p_text(finding.p)}); use zero_mean"
     )
 
 
@@ -389,7 +390,7 @@ def _(finding: BetweenRuns) -> str:
     unit = UM if finding.unit == "m" else ARCSEC
     return (
         f"the {finding.runs} runs differ by more than their uncertainties: a variation of "
-        f"{finding.size * unit.per_si:.3g} {unit.name} (rms) between runs, p = {finding.p:.2g}, "
+        f"{finding.size * unit.per_si:.3g} {unit.name} (rms) between runs, {p_text(finding.p)}, "
         "is in U"
     )
 
@@ -449,8 +450,8 @@ def _(finding: NoisyView) -> str:
 @sentence_of.register
 def _(finding: TooManyOutliers) -> str:
     return (
-        f"more than {finding.limit:.0%} of the readings contradict the others: none was removed; "
-        "look for a wrong plan or a faulty view"
+        f"more than {100 * finding.limit:.0f} % of the readings contradict the others: none was "
+        "removed; look for a wrong plan or a faulty view"
     )
 
 

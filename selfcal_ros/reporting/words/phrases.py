@@ -35,6 +35,7 @@ from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
+from selfcal_ros.reporting.summary.numbers import p_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {
@@ -167,7 +168,7 @@ def line_text(line: BudgetLine) -> str:
                 if allowed is None
                 else f"too small for the readings; of {allowed:.3g}, which they allow, they"
             )
-            return f"size {given:.3g}, {but} leave {remaining:.0%}"
+            return f"size {given:.3g}, {but} leave {100 * remaining:.0f} %"
         case OfCause(cause) if cause == LACK_OF_FIT:
             return "residuals beyond the scatter of repeats, met in full at every place"
         case OfCause(cause):
@@ -209,10 +210,10 @@ def recheck_sentence(recheck: Recheck) -> str:
     if scale.changed:
         return (
             f"{_scale_changed(since, scale, one_pass=recheck.passes == 1)}; otherwise no "
-            f"change beyond its uncertainty (p = {recheck.p:.2g}); {clearest}"
+            f"change beyond its uncertainty ({p_text(recheck.p)}); {clearest}"
         )
     return (
-        f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {recheck.p:.2g}); "
+        f"{STILL_GOOD}: no change since {since} beyond its uncertainty ({p_text(recheck.p)}); "
         f"{clearest}"
     )
 
@@ -226,14 +227,14 @@ def _changed(since: str, clearest: str, p: float) -> str:
     return (
         f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
         "clean and placed as planned, and the camera was not touched (if it was, declare it: "
-        f"--microscope 0.01); {clearest} (p = {p:.2g})"
+        f"--microscope 0.01); {clearest} ({p_text(p)})"
     )
 
 
 def _scale_changed(since: str, scale: ScaleChange, *, one_pass: bool) -> str:
     how_much = (
         f"by {scale.change * UM_PER_M:+.3g} ± {scale.u * UM_PER_M:.2g} µm/m (k=1, "
-        f"p = {scale.p:.2g})"
+        f"{p_text(scale.p)})"
     )
     if one_pass:
         return f"Scale changed or drifted since {since} {how_much}; {ONE_PASS}"
@@ -271,8 +272,8 @@ def _clearest(of: LargestChange) -> str:
 def recheck_lines(recheck: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
     out = [
-        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, u "
-        f"{recheck.u_rms * UM_PER_M:.5f} µm, p = {recheck.p_xy:.2g}"
+        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, "
+        f"u {recheck.u_rms * UM_PER_M:.5f} µm, {p_text(recheck.p_xy)}"
     ]
     if (sizes := recheck.detectable) is not None:
         out.append(
@@ -281,8 +282,9 @@ def recheck_lines(recheck: Recheck) -> list[str]:
         )
     if (turn := recheck.largest_theta) is not None:
         out.append(
-            f"theta  clearest at line {turn.line}: {turn.change * ARCSEC_PER_RAD:+.4f} "
-            f"± {turn.u * ARCSEC_PER_RAD:.4f} arcsec (k=1), p = {recheck.p_theta:.2g}"
+            f"theta  clearest at line {turn.line}: "
+            f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
+            f"arcsec (k=1), {p_text(recheck.p_theta)}"
         )
     if recheck.passes == 1:
         out.append(ONE_PASS)
@@ -290,7 +292,7 @@ def recheck_lines(recheck: Recheck) -> list[str]:
     return [
         *out,
         f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
-        f"against the plate (k=1), p = {scale.p:.2g}",
+        f"against the plate (k=1), {p_text(scale.p)}",
     ]
 
 
@@ -302,28 +304,29 @@ def changed_text(finding: Changed) -> str:
 def changed_or_drifted_text(finding: ChangedOrDrifted) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
     return (
-        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} (p = "
-        f"{finding.p:.2g}); {ONE_PASS}"
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
+        f"({p_text(finding.p)}); {ONE_PASS}"
     )
 
 
 def changed_or_microscope_text(finding: ChangedOrMicroscope) -> str:
     """Return the reason why a change that a microscope explains too is not qualified."""
     return (
-        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} (p = "
-        f"{finding.p:.2g}); a changed stage, or a microscope with a scale wrong by "
-        f"{finding.scale:+.1%} ± {finding.u_scale:.1%} and turned by "
-        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} "
-        "mrad (k=1) explains it alike: measure check stops (check_stops in the plan), "
-        "or correct the pixel size"
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
+        f"({p_text(finding.p)}); a changed stage, or a microscope with a scale wrong by "
+        f"{100 * finding.scale:+.1f} % ± {100 * finding.u_scale:.1f} % and turned by "
+        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad (k=1) "
+        "explains it alike: measure check stops (check_stops in the plan), or correct the "
+        "pixel size"
     )
 
 
 def microscope_off_text(finding: MicroscopeOff) -> str:
     """Return the warning of a microscope that is not as assumed, which the readings correct."""
     return (
-        f"the scale of the microscope is wrong by {finding.size:+.2%} ± {finding.u:.2%} and it is "
-        f"turned by {finding.turn * MRAD_PER_RAD:+.3g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad "
+        f"the scale of the microscope is wrong by {100 * finding.size:+.2f} % ± "
+        f"{100 * finding.u:.2f} % and it is turned by "
+        f"{finding.turn * MRAD_PER_RAD:+.3g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad "
         "(k=1), as visits of one mark at several places show: the readings were corrected by "
         "that; correct the pixel size before the next calibration"
     )
@@ -339,6 +342,6 @@ def misfit_text(finding: PlateMisfit) -> str:
     """Return the reason why readings do not fit a known plate."""
     return (
         f"residuals are {finding.size:.2f} times what the noise and the known plate allow "
-        f"(p = {finding.p:.2g}): is it that plate, does it lie as planned, and has the map "
+        f"({p_text(finding.p)}): is it that plate, does it lie as planned, and has the map "
         "enough nodes?"
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.reporting.summary.numbers import truth_figures
+from selfcal_ros.reporting.summary.numbers import p_text, truth_figures
 from test.support.results import known_result
 
 
@@ -42,3 +42,10 @@ def test_two_u_is_the_limit(factor, within):
     g_theta = truth["g_theta"] + np.array([factor * 1e-3, 0.0, 0.0, 0.0])
     emap = replace(result.error_map, g_theta=g_theta, u_g_theta=u)
     assert truth_figures(emap, truth).theta_within_2u == within
+
+
+@pytest.mark.parametrize(
+    ("p", "text"), [(0.7243, "p = 0.72"), (0.0, "p < 1e-300"), (None, "p = –")]
+)
+def test_a_probability_is_never_0(p, text):
+    assert p_text(p) == text

@@ -250,8 +250,9 @@ def strained(part, size):
                 1e-8,
                 share_before=0.4,
             ),
-            "a plate that slipped by (0.3, -0.4) µm and 1 µrad after about 40% of "
-            "view '90': measure the view again, or solve with --robust",
+            "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
+            "about 40 % of view '90': measure the "
+            "view again, or solve with --robust",
             5e-7,
             1e-8,
             "m",
@@ -509,7 +510,7 @@ FINDINGS = [
     ),
     (
         TooManyOutliers(limit=0.1),
-        "more than 10% of the readings contradict the others: none was removed; look for a wrong "
+        "more than 10 % of the readings contradict the others: none was removed; look for a wrong "
         "plan or a faulty view",
     ),
     (OutliersKept(), "removing more outliers would leave the stage undetermined"),
