@@ -18,7 +18,7 @@ SIGMA_M = 20e-9
 
 
 def unchecked(sites, lines):
-    return Unchecked(sites=sites, lines=lines)
+    return Unchecked(sites=tuple(map(tuple, sites)), lines=tuple(lines))
 
 
 def one_by_one(site, mark):
