@@ -21,7 +21,7 @@ from selfcal_ros.collection.inputs import (
     Phase,
     Reason,
 )
-from selfcal_ros.errors import printable
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.checks.wiring import (
     sign_of_lines_is_shown,
     wiring_error,
@@ -435,8 +435,22 @@ class CellCheck:
         return self._send(Phase.MEASURE, view)
 
     def _send(self, phase: Phase, view: View | None = None) -> Command:
-        """Send a command of its own run, stamped now."""
-        stamp = max(self._ports.now_ns(), self._command.stamp_ns + 1)
+        """Send a command of its own run, stamped now.
+
+        Raises
+        ------
+        InputError
+            If the clock was set back: the cell would take the command for one of before.
+        """
+        now_ns = self._ports.now_ns()
+        back_s = (self._command.stamp_ns - now_ns) * S_PER_NS
+        if back_s > 0:
+            raise InputError(
+                "clock of this machine",
+                f"it was set back by {back_s:.3g} s or more during the check",
+                "synchronise it first",
+            )
+        stamp = max(now_ns, self._command.stamp_ns + 1)
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
         self._command = Command(

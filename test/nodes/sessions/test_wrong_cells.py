@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Phase
+from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.sessions import cell_check
 from selfcal_ros.nodes.sessions.cell_check import (
     MOST_KEPT,
@@ -470,6 +472,17 @@ def kept_of(number: int) -> int:
 
 def test_names_of_statuses_without_end_take_no_memory():
     assert kept_of(8 * MOST_KEPT) < 1.1 * kept_of(MOST_KEPT) < 1_000_000
+
+
+def test_a_clock_that_is_set_back_ends_the_check():
+    hands = Hands()
+    check = CellCheck(
+        small_plan(), settings_of("measurement_collector"), hands.ports, settle_s=0.0
+    )
+    check._send(Phase.PLACE, check.view)
+    hands.pass_time(-3.0)
+    with pytest.raises(InputError, match=r"it was set back by 3 s or more during the"):
+        check._send(Phase.MEASURE, check.view)
 
 
 def test_joints_without_end_do_not_hide_those_of_the_stage():
