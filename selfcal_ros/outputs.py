@@ -2,6 +2,7 @@
 """Atomic file output, and text in ASCII."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -21,6 +22,8 @@ import numpy as np
 from selfcal_ros import portable
 from selfcal_ros.errors import InputError, first_line
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a disk that has no room for a file."""
 TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
 """Names of unfinished files and folders, locked by their writer."""
 _ASCII = {
@@ -62,7 +65,9 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise InputError(
             str(target),
             f"cannot be written ({error.strerror or first_line(error)})",
-            "name an existing, writable folder",
+            "free some space or name another folder"
+            if error.errno in FULL
+            else "name an existing, writable folder",
         ) from error
 
 

@@ -67,7 +67,7 @@ def test_on_a_full_disk_none_of_its_files_is_left(tmp_path, monkeypatch, capsys)
         assert new(*STAGE, "--minutes", "20") == 2
     assert capsys.readouterr().err == (
         "selfcal plan new: cell.yaml: cannot be written (File too large); "
-        "name an existing, writable folder\n"
+        "free some space or name another folder\n"
     )
     assert not list(tmp_path.iterdir())
 
