@@ -146,7 +146,7 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
         action="append",
         help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
-        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no terms, "
+        "e.g. drift,plate_shape:30e-9; in addition to those of the plan; none: no terms, "
         "not even those assumed by default (docs/theory/estimation.md)",
     )
     parser.add_argument(

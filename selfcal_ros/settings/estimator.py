@@ -15,6 +15,8 @@ from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.terms import (
     ModelTerm,
     default_terms,
+    in_order,
+    merged,
     microscope_term,
     parse_terms,
 )
@@ -147,8 +149,9 @@ def solver_options(
 ) -> Options:
     """Return the estimator's options in a solver's settings.
 
-    If `model_terms` is empty, the terms in the plan of the `measurements` are used; if `plate_from`
-    is, the calibration that the plan names: the one it verifies, or that of the plate.
+    The terms of `model_terms` replace the same ones in the plan of the `measurements`; if
+    `plate_from` is empty, the calibration that the plan names is used: the one it verifies, or that
+    of the plate.
 
     Raises
     ------
@@ -237,14 +240,8 @@ def _terms(
         )
     if not words and measurements is not None:
         return planned, "plan"
-    terms = parse_terms(entries, "model_terms")
-    # the microscope's uncertainty in the plan is not a choice of a model
-    microscope_terms = [
-        term
-        for term in planned
-        if term.parts and term.name not in {t.name for t in terms}
-    ]
-    return (*terms, *microscope_terms), "options"
+    # what the plan declares of other terms holds all the same
+    return in_order(merged(planned, parse_terms(entries, "model_terms"))), "options"
 
 
 def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:

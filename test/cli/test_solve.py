@@ -88,7 +88,7 @@ def without(events, kind):
     return [event for event in events if not isinstance(event, kind)]
 
 
-def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
+def test_the_terms_of_the_plan_travel_in_the_bag_and_options_add_to_them(tmp_path):
     plan = replace(small_plan(), model_terms=("plate_scale:1e-06",))
     bag = small_bag(tmp_path, plan)
     found = {}
@@ -114,7 +114,7 @@ def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
     ]
     assert found == {
         "plan": (["plate_scale", *assumed], "plan"),
-        "options": (["drift", *assumed], "options"),
+        "options": (["drift", "plate_scale", *assumed], "options"),
         "none": ([], None),
     }
 

@@ -276,10 +276,12 @@ def asked(*terms: str) -> Measurements:
         ([""], ("drift:1e-08",), ["drift:1e-08"], "plan"),
         (
             ["approach,microscope"],
-            ("drift:1e-08",),
-            ["microscope", "approach"],
+            ("drift:1e-08", "microscope:0.05:0.01:0.002"),
+            ["microscope", "drift:1e-08", "approach"],
             "options",
         ),
+        (["drift"], ("drift:1e-08",), ["drift"], "options"),
+        (["drift:0"], ("drift", "approach"), ["drift:0", "approach"], "options"),
         (["none"], ("drift:1e-08",), [], ""),
         ([" none "], (), [], ""),
         (["none,"], ("drift:1e-08",), [], ""),
@@ -287,7 +289,9 @@ def asked(*terms: str) -> Measurements:
         (["drift"], (), ["drift"], "options"),
     ],
 )
-def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
+def test_given_terms_win_over_the_same_of_the_plan_which_keeps_its_others(
+    given, planned, terms, origin
+):
     settings = SolverSettings.checked({"model_terms": given}, "here")
     options = solver_options(settings, asked(*planned))
     assert ([str(term) for term in options.terms], options.terms_from) == (
@@ -361,15 +365,16 @@ def test_what_is_known_of_the_microscope_is_assumed_unless_somebody_says_otherwi
     assert model_of(scale_u=0.0, rotation_u=0.0, shear_u=0.0) == ASSUMED[1:]
 
 
-def test_what_a_plan_knows_of_its_microscope_outlives_another_model():
-    planned = ("microscope:0.05:0.01:0.002", "approach")
-    assert model_of(planned) == [*planned, *ASSUMED[1:]]
+def test_what_a_plan_declares_outlives_options_for_other_terms():
+    planned = ("microscope:0.05:0.01:0.002", "plate_shape:3e-08", "approach")
+    others = [text for text in ASSUMED[1:] if not text.startswith("plate_shape")]
+    assert model_of(planned) == [*planned, *others]
     assert model_of(planned, model_terms=["drift"], scale_u=0.1) == [
-        "drift",
         planned[0],
-        *ASSUMED[1:],
+        "drift",
+        *planned[1:],
+        *others,
     ]
-    assert model_of(planned, model_terms=["microscope:0"]) == ASSUMED[1:]
+    # as --microscope does: it declares an instrument, and chooses no model
+    assert model_of(planned, model_terms=["microscope:0"]) == [*planned[1:], *others]
     assert model_of(planned, model_terms=["none"]) == []
-    # a plan that only wants one estimated says nothing about it
-    assert model_of(("microscope",), model_terms=["drift"]) == ["drift", *ASSUMED]

@@ -125,6 +125,7 @@ def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
     own = Desk(model_terms=["plate_shape:1e-08"])
     own.take(views_of(plan))
     assert [term.name for term in own.session.result.model.terms] == [
+        "plate_scale",
         "plate_shape",
         *(name for name in ASSUMED if name != "plate_shape"),
     ]
