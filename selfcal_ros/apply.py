@@ -17,7 +17,10 @@ from numpy.typing import ArrayLike
 from selfcal_ros.compensation.cells import SNAP, Interpolation, Outside, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.comparison.covariance import covariance_of, lack_of_fit_m
+from selfcal_ros.estimation.comparison.covariance import (
+    covariance_of,
+    variance_of_each_place,
+)
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.results import read_result
@@ -217,13 +220,17 @@ class StageMap(Compensator):
                 "solve again with uncertainties; fields beyond 31 x 31 marks have none",
             )
         # what has a sign of its own at each place has it between the sites as well
-        lack_of_fit_m2 = lack_of_fit_m(self.result) ** 2
-        sites[np.diag_indices_from(sites)] -= lack_of_fit_m2
+        of_each_place = variance_of_each_place(self.result).reshape(2, -1)[
+            :, used_sites
+        ]
+        sites[np.diag_indices_from(sites)] -= of_each_place.ravel()
         weights_xy = np.kron(np.eye(2), weights[:, used_sites])
         cells = np.stack([self._cell(x, 0), self._cell(y, 1)])
         alike = (cells[:, :, None] == cells[:, None, :]).all(axis=0)
         cover = weights_xy @ sites @ weights_xy.T
-        cover[np.diag_indices_from(cover)] += lack_of_fit_m2
+        near = abs(weights[:, used_sites])
+        near /= near.sum(axis=1, keepdims=True)
+        cover[np.diag_indices_from(cover)] += (of_each_place @ near.T).ravel()
         for axis, more in enumerate(self._between(x, y)):
             rows = slice(axis * len(x), (axis + 1) * len(x))
             cover[rows, rows] += alike * np.outer(more, more)

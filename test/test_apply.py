@@ -13,9 +13,11 @@ from selfcal_ros import apply
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import covariance_of
+from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.uncertainty import Effect, enlarged
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.kept import NOISE, ROUGHNESS
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
@@ -174,6 +176,40 @@ def test_what_residuals_have_beyond_repeats_is_met_at_both_ends_of_a_distance():
         u_over_lack.append(np.median(u) / lack)
     assert min(inside) > 0.9
     assert np.median(u_over_lack) == pytest.approx(np.sqrt(2), rel=0.2)
+
+
+def test_more_noise_scales_u_of_distances_and_of_squareness_as_at_the_nodes(result):
+    """A noisy view is more of the same noise: it moves no two places together."""
+    nothing = np.zeros(len(result.error_map.g_theta))
+    u_plate = np.stack([result.artifact_map.u_ax, result.artifact_map.u_ay])
+    noisier = enlarged(
+        result,
+        [Effect(NOISE, np.sqrt(3) * result.error_map.u_xy, nothing, 3**0.5 * u_plate)],
+    )
+    ends = (-0.02, 0.01), (0.01, -0.01)
+    before, after = (StageMap(r).length_error(*ends)[1] for r in (result, noisier))
+    np.testing.assert_allclose(after, 2 * before, rtol=1e-5)
+    np.testing.assert_allclose(
+        first_order_u(noisier), 2 * np.array(first_order_u(result)), rtol=1e-5
+    )
+    known = np.ones(result.artifact.shape, dtype=bool)
+    for of_plate in (False, True):
+        covers = [
+            covariance_of(r, "xy", known, plate=of_plate) for r in (result, noisier)
+        ]
+        np.testing.assert_allclose(
+            covers[1], 4 * covers[0], rtol=1e-4, atol=1e-5 * covers[0].max()
+        )
+
+
+def test_what_the_nodes_do_not_follow_is_met_at_both_ends_of_a_distance(result):
+    """Also at two nodes to which its effect gives the same sign."""
+    rough_m = np.broadcast_to(3e-8, (2, *result.artifact.shape))
+    nothing = np.zeros(len(result.error_map.g_theta))
+    rough = enlarged(result, [Effect(ROUGHNESS, rough_m, nothing)])
+    for ends in (((-0.02, 0.0), (0.02, 0.0)), ((-0.01, 0.01), (0.01, -0.01))):
+        before, after = (StageMap(r).length_error(*ends)[1] for r in (result, rough))
+        assert np.sqrt(after**2 - before**2) == pytest.approx(np.sqrt(2) * 3e-8)
 
 
 def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result):

@@ -127,12 +127,13 @@ RESULT = {
     "default), details, text",
     "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
-    "those of lack_of_fit add to variances alone; up to 31 × 31 sites, and not with "
-    "`--model none`; beside: what they make of the plate, (r, 2, N, N), of both "
-    "angular maps, (r, 2, K), and of the microscope, (r, 4), the last two times the "
-    "plate's longer half width; with_map: how many of them belong to the factors; "
-    "effects_on_plate: what effects outside the model add to the variance of the "
-    "plate's map, (2, nx, ny), over σ²",
+    "those of lack_of_fit and roughness add to variances alone, that of noise scales the others; "
+    "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
+    "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
+    "microscope, (r, 4), the last two times the plate's longer half width; "
+    "with_map: how many of them belong to the factors; effects_on_plate: what "
+    "effects outside the model add to the variance of the plate's map, "
+    "(2, nx, ny), over σ²",
     "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
     "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "

@@ -23,6 +23,12 @@ FACTORS, ANGULAR, ADDED, IMAGES, COVARIANCE = KEYS = (
 LACK_OF_FIT = "lack_of_fit"
 """Name of the effect of what residuals have beyond the scatter of repeats."""
 
+ROUGHNESS = "roughness"
+"""Name of the effect of what the nodes of a map do not follow."""
+
+NOISE = "noise"
+"""Name of the effect of views that are noisier than the others."""
+
 DIGITS = 7
 """Digits that are kept of a number."""
 
@@ -81,7 +87,7 @@ class Factors:
         The term, or the effect, that each factor belongs to.
     of_map : float array (r, 2, nx, ny)
         Factors L of the covariance L' L of Gx, then Gy. Those `of_each_place` add to its diagonal
-        alone.
+        alone; those `of_size` make the covariance of noise and terms larger as a whole.
     beside : dict of float array (s, ...)
         What each factor makes of other quantities: `plate` (s, 2, nx, ny), as those of the map;
         `lines` (s, 2, K), the angular maps of stage and plate, and those of the block of the
@@ -106,8 +112,18 @@ class Factors:
 
     @property
     def of_each_place(self) -> np.ndarray:
-        """Factors of what has a sign of its own at each place: lack of fit, bool (r,)."""
-        return np.isin(self.terms, LACK_OF_FIT)
+        """Factors of what has a sign of its own at each place, bool (r,)."""
+        return np.isin(self.terms, (LACK_OF_FIT, ROUGHNESS))
+
+    @property
+    def of_size(self) -> np.ndarray:
+        """Factors of what is more of the same noise: it has no sign, bool (r,)."""
+        return np.isin(self.terms, NOISE)
+
+    @property
+    def of_fields(self) -> np.ndarray:
+        """Factors that are fields, with a sign that all places share, bool (r,)."""
+        return ~(self.of_each_place | self.of_size)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""

@@ -158,7 +158,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         shear = factors.system.gauge.shear
         saved = factors_of(result)
         row = turned_over(result.sense, shear).conj()
-        common = _complex(saved.of_map[~saved.of_each_place])
+        common = _complex(saved.of_map[saved.of_fields])
         of_terms = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
         added = result.kept.added
         variance = (
@@ -166,28 +166,45 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
             + (of_terms**2).sum(axis=0)
             + (0.0 if added is None else added)
         )
-        variance = variance * result.noise.sigma_xy**2
-        variance += lack_of_fit_m(result) ** 2 * (abs(shear) ** 2).sum(axis=(1, 2))
+        variance = variance * result.noise.sigma_xy**2 * _noisier(result)
+        of_each_place = variance_of_each_place(result)
+        variance += (
+            row.real**2 * of_each_place[0] + row.imag**2 * of_each_place[1]
+        ).sum(axis=(1, 2))
         variance = variance / factors.half_width_m**2
     o, r = np.sqrt(variance)
     return float(o), float(r)
 
 
-def _product(factors: np.ndarray, of_each_place: np.ndarray) -> np.ndarray:
-    """Return the covariance L' L of factors (r, q), or their variances alone where so marked."""
-    common = factors[~of_each_place]
-    cover = common.T @ common
-    cover[np.diag_indices_from(cover)] += (factors[of_each_place] ** 2).sum(axis=0)
+def _product(saved: Factors, known_sites: np.ndarray, first: int = 0) -> np.ndarray:
+    """Return the covariance of Gx, then Gy, at sites by factors from the `first` on, (2n, 2n)."""
+    factors = saved.of_map[first:][:, :, known_sites]
+    factors = factors.reshape(len(factors), 2 * int(known_sites.sum()))
+    fields = factors[saved.of_fields[first:]]
+    cover = fields.T @ fields
+    of_each_place = factors[saved.of_each_place[first:]]
+    cover[np.diag_indices_from(cover)] += (of_each_place**2).sum(axis=0)
     return cover
 
 
-def lack_of_fit_m(result: CalibrationResult) -> float:
-    """Return the contribution of lack of fit to u, m: at each place, with a sign of its own."""
-    factors = factors_of(result)
-    squares = (factors.of_map[factors.of_each_place] ** 2).sum(axis=0)
-    return float(
-        np.sqrt(squares.max(initial=0.0)) * np.nan_to_num(result.noise.sigma_xy)
+def variance_of_each_place(result: CalibrationResult) -> np.ndarray:
+    """Return the part of u^2 with a sign of its own at each place, (2, nx, ny) m^2."""
+    saved = factors_of(result)
+    of_each_place_m = saved.of_map[saved.of_each_place] * np.nan_to_num(
+        result.noise.sigma_xy
     )
+    return (of_each_place_m**2).sum(axis=0)
+
+
+def _noisier(result: CalibrationResult) -> float:
+    """Return the variance of noise and terms over what it is without views that are noisier."""
+    saved = factors_of(result)
+    more = (saved.of_map[saved.of_size] ** 2).sum()
+    if not more:
+        return 1.0
+    stated = np.nansum(result.error_map.u_xy**2) / result.noise.sigma_xy**2
+    effects = (saved.of_map[saved.with_map :] ** 2).sum()
+    return float(1 + more / (stated - effects))
 
 
 def _complex(factors: np.ndarray) -> np.ndarray:
@@ -410,11 +427,8 @@ class Together:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
         if known_sites.size > MAX_FULL or self.lacks_terms:
             return None
-        factors = self._saved.of_map[:, :, known_sites].reshape(
-            -1, 2 * int(known_sites.sum())
-        )
         return self.of_noise(self.stage_rows(known_sites)) + _product(
-            factors, self._saved.of_each_place
+            self._saved, known_sites
         )
 
     def of_lines(self, known_lines: np.ndarray) -> np.ndarray | None:
@@ -456,7 +470,8 @@ class Together:
     @property
     def _effects(self) -> np.ndarray:
         """Effects that are not terms of the model, for unit noise, (e, 2, nx, ny)."""
-        return self._saved.of_map[self._saved.with_map :]
+        effects = np.arange(len(self._saved.terms)) >= self._saved.with_map
+        return self._saved.of_map[effects & ~self._saved.of_size]
 
     @property
     def _effects_on_plate(self) -> np.ndarray:
@@ -474,20 +489,18 @@ class Together:
         return saved.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
-        """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
+        """Return the effect of terms on G, A and the microscope, (r, q)."""
         plate = self._saved_factors("plate", (2, *marks.shape))
-        stage = self._saved.of_map
-        effects = len(self._effects)
+        n = self._saved.with_map
+        stage = self._saved.of_map[:n]
         n_of_stage = 2 * int(sites.sum())
-        n = len(stage) - effects
         r = len(plate)
-        maps = np.zeros((r + effects, n_of_stage + 2 * int(marks.sum()) + 4))
-        of_stage = stage[:, :, sites].reshape(len(stage), n_of_stage)
-        maps[:n, :n_of_stage], maps[r:, :n_of_stage] = of_stage[:n], of_stage[n:]
-        maps[:r, n_of_stage:-4] = plate[:, :, marks].reshape(
+        maps = np.zeros((r, n_of_stage + 2 * int(marks.sum()) + 4))
+        maps[:n, :n_of_stage] = stage[:, :, sites].reshape(n, n_of_stage)
+        maps[:, n_of_stage:-4] = plate[:, :, marks].reshape(
             r, maps.shape[1] - n_of_stage - 4
         )
-        maps[:r, -4:] = (
+        maps[:, -4:] = (
             self._saved_factors(block_of_offsets().name, (4,)) / self.half_width_m
         )
         return maps
@@ -511,8 +524,7 @@ class Together:
             np.concatenate([np.zeros((s, *rows_a.shape[1:])), rows_a]),
         )
         factors = self._factors(sites, marks)
-        terms = len(factors) - len(self._effects)
-        cover = exact + factors[:terms].T @ factors[:terms]
+        cover = exact + factors.T @ factors
         if self._images is None:
             cover[:-4, :-4] *= self._ratio
         else:  # their noise moves the stage's map much and the plate's little
@@ -520,9 +532,8 @@ class Together:
                 np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4])
             )
             cover *= np.outer(root, root)
-        effects = factors[terms:]
-        cover += _product(effects, self._saved.of_each_place[self._saved.with_map :])
-        if len(effects):
+        cover[:s, :s] += _product(self._saved, sites, self._saved.with_map)
+        if len(self._effects):
             cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[
                 :, marks
             ].ravel()
@@ -534,8 +545,8 @@ class Together:
         emap = self.result.error_map
         sites = self.sites
         white = np.trace(self.of_noise(self.stage_rows(sites)))
-        factors = self._saved.of_map[..., sites]
-        white += (factors**2).sum()
+        factors = self._saved.of_map[~self._saved.of_size]
+        white += (factors[..., sites] ** 2).sum()
         effects = (self._effects[..., sites] ** 2).sum()
         stated = (emap.u_gx[sites] ** 2 + emap.u_gy[sites] ** 2).sum()
         sigma = max(self.result.noise.sigma_xy, np.finfo(float).tiny)

@@ -38,7 +38,6 @@ from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
-from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
@@ -68,7 +67,7 @@ from selfcal_ros.model.findings import (
     ViewLeftOut,
     VisitedOnce,
 )
-from selfcal_ros.model.kept import LACK_OF_FIT
+from selfcal_ros.model.kept import LACK_OF_FIT, ROUGHNESS
 from selfcal_ros.model.readings import (
     AFTER_SLIP,
     REPEAT_OUTLIER,

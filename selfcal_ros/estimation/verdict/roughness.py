@@ -31,12 +31,10 @@ from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_r
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.findings import Cause
+from selfcal_ros.model.kept import ROUGHNESS as NAME
 from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
-
-NAME = "roughness"
-"""Name of the cause, and of the effect."""
 
 SIZES = (1e-2, 1e6, 65)
 """Trial sizes of the further coefficients, over the noise of the best one, and their number."""

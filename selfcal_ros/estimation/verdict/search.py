@@ -46,6 +46,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.findings import Cause, Remedy
+from selfcal_ros.model.kept import NOISE
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, merged
 from selfcal_ros.model.verdict import TermResult
@@ -583,8 +584,19 @@ def _noisy_views(search: SearchResult, measurements: Measurements) -> None:
         default=0,
     )
     if (ratio := largest / search.solved.xy.sigma) > 1:
-        more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)
-        search.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
+        plate = search.solved.result.artifact_map
+        more = np.sqrt(ratio**2 - 1)
+        on_plate = None
+        if plate.u_ax.size:
+            on_plate = more * np.nan_to_num(np.stack([plate.u_ax, plate.u_ay]))
+        search.effects.append(
+            Effect(
+                NOISE,
+                more * np.nan_to_num(emap.u_xy),
+                np.zeros(len(emap.g_theta)),
+                on_plate,
+            )
+        )
     search.causes += sorted(noisy, key=lambda cause: cause.p)
 
 

@@ -25,7 +25,7 @@ from selfcal_ros.model.budget import (
     OfTerm,
 )
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
-from selfcal_ros.model.kept import rounded
+from selfcal_ros.model.kept import NOISE, rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult, Noise
@@ -103,13 +103,12 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
         return result
     emap, plate, kept_parts = result.error_map, result.artifact_map, result.kept
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
-    of_plate = sum(
-        (
-            np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
-            for effect in effects
-        ),
-        np.zeros((2, *plate.ax.shape)),
-    )
+    of_plate, of_fields = np.zeros((2, 2, *plate.ax.shape))
+    for effect in effects:
+        added = np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
+        of_plate += added
+        if effect.name != NOISE:  # it is no field, but more of what there is
+            of_fields += added
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
         before = factors_of(result)
@@ -122,7 +121,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
                 of_map=np.concatenate(
                     [before.of_map, [rounded(effect.xy / sigma) for effect in effects]]
                 ),
-                on_plate=rounded(of_plate / sigma**2),
+                on_plate=rounded(of_fields / sigma**2),
             ),
         )
     turned = dict(kept_parts.angular)
