@@ -11,6 +11,7 @@ from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.cli.terminal import (
+    Once,
     add_json,
     add_parameters,
     aside,
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> 
     add_options(parser, names)
     parser.add_argument(
         "--reference",
+        action=Once,
         metavar="KIND:ERROR:U",
         help="known length that sets the "
         "scale: artifact, stage_x or stage_y, its relative error and the standard "
@@ -151,6 +153,7 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
     )
     parser.add_argument(
         "--microscope",
+        action=Once,
         metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
         help="standard uncertainties of the microscope's scale, rotation (rad) "
         "and shear (default: 0.01:0.01:0.002)",

@@ -21,6 +21,25 @@ STDOUT = "-"
 """Name of an output file: the result goes to stdout, everything else to stderr."""
 
 
+class Once(argparse.Action):
+    """Stores what is known of a measurement, once: of two values one would be lost unsaid."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Store the value, or end with a line if another one was given before."""
+        before = getattr(namespace, self.dest, None)
+        if before not in (None, values):
+            parser.error(
+                f"argument {option_string}: given as {before} and as {values}; keep one of them"
+            )
+        setattr(namespace, self.dest, values)
+
+
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
     """Add the option ``--json``."""
     parser.add_argument(
@@ -51,6 +70,7 @@ def add_parameters(
             {"action": "store_true", "default": None}
             if default is False
             else {
+                "action": Once if name.startswith("reference_") else "store",
                 "type": type(default),
                 "choices": parameter.choices or None,
                 "metavar": None

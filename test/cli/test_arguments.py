@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files among the arguments: what exists is not replaced, what is of another kind is named."""
+"""Arguments: no file, no value is replaced unless told; a file of another kind is named."""
+
+import shlex
 
 import pytest
 
 from selfcal_ros.cli.arguments import kind_of
-from selfcal_ros.cli.main import main
+from selfcal_ros.cli.main import build_parser, main
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import refuse_existing, write_json, write_text
@@ -179,3 +181,34 @@ def test_a_file_that_another_command_wrote_meanwhile_stays(tmp_path):
     for text in ("first", "second"):
         write_text(tmp_path / "b.csv", text)
     assert (tmp_path / "b.csv").read_text() == "second"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--reference", "artifact:1e-6:1e-7", "--reference", "stage_x:5e-6:1e-7"],
+            "--reference: given as artifact:1e-6:1e-7 and as stage_x:5e-6:1e-7; keep one of them",
+        ),
+        (
+            ["--reference-at=20:0.1:8e-6:0", "-o", "a", "--reference-at=21:0.1:8e-6:0"],
+            "--reference-at: given as 20:0.1:8e-6:0 and as 21:0.1:8e-6:0; keep one of them",
+        ),
+    ],
+)
+def test_of_two_references_none_is_lost(capsys, words, said):
+    with pytest.raises(SystemExit) as ended:
+        main(["solve", "none.mcap", *words])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(f"selfcal solve: argument {said}")
+
+
+def test_the_same_value_twice_is_one_value_and_terms_add_up():
+    parser = build_parser("solve")
+    for _ in range(2):
+        args = parser.parse_args(
+            shlex.split(
+                "solve BAG --microscope 0 --microscope 0 --model drift --model yaw"
+            )
+        )
+        assert (args.microscope, args.model) == ("0", ["drift", "yaw"])
