@@ -201,7 +201,7 @@ def test_a_module_that_is_missing_is_named_with_the_extra_that_installs_it(
     """Each extra of setup.py has one, but that of the tests."""
     declared = (ROOT / "setup.py").read_text().partition("extras_require={")[2]
     extras = set(re.findall(r'^ +"(\w+)": \[', declared.partition("},")[0], re.M))
-    assert set(EXTRAS.values()) == extras - {"test"}
+    assert set(EXTRAS.values()) == extras - {"test"}, "correct EXTRAS of cli/main.py"
 
     def lacks(name):
         raise ModuleNotFoundError(name=name)
