@@ -15,6 +15,7 @@ from selfcal_ros.files import csv_cells, read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.plain_numbers import number_of
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 FAR = 10.0
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         stage.result,
         text,
         "csv",
-        note=f", {len(points)} points",
+        note=f", {counted(len(points), 'point')}",
         points=len(points),
         unknown=unknown,
         outside=outside,

@@ -51,6 +51,7 @@ from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.model.reference import check_celsius
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC, URAD_PER_RAD
 
@@ -200,8 +201,10 @@ def _check(args: argparse.Namespace) -> int:
         for table in cal.tables:
             tell(f"{args.file}:{table.line}: {_described(table)['text']}")
         tell(
-            f"{args.file}: {len(cal.tables)} tables, {counts[Severity.ERROR]} errors, "
-            f"{counts[Severity.WARNING]} warnings, {counts[Severity.TOLERATED]} tolerated"
+            f"{args.file}: {counted(len(cal.tables), 'table')}, "
+            f"{counted(counts[Severity.ERROR], 'error')}, "
+            f"{counted(counts[Severity.WARNING], 'warning')}, "
+            f"{counts[Severity.TOLERATED]} tolerated"
         )
     refuse_errors(cal)
     if args.strict and cal.findings:

@@ -15,6 +15,7 @@ from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_setti
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import write_bytes
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.vision.detector import Judged, Mark
@@ -167,7 +168,7 @@ def text_of(output: str, counts: dict[str, int]) -> str:
     ]
     return "; ".join(
         [
-            f"{output}: {counts['marks']} marks in {counts['images']} images",
+            f"{output}: {counted(counts['marks'], 'mark')} in {counted(counts['images'], 'image')}",
             *([f"rejected: {rejected}"] if rejected else []),
             *extra_counts,
         ]

@@ -305,7 +305,7 @@ def _check_text(
         else f"a list of {artifact.shape[0]}"
     )
     lines = [
-        f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of {marks} marks, "
         f"{artifact.angular_count or 'no'} angular lines",
         *_nodes_text(plan),
         *_image_text(plan),

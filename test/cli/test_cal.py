@@ -64,7 +64,7 @@ def test_export_check_eval_verify(run):
     assert "the correction is largest at x = " in steps[3]
     code, out, _ = run("check", "f.cal", "--strict")
     assert code == 0 and out.endswith(
-        "f.cal: 1 tables, 0 errors, 0 warnings, 0 tolerated\n"
+        "f.cal: 1 table, 0 errors, 0 warnings, 0 tolerated\n"
     )
     code, out, _ = run("eval", "f.cal", "--position", "1=10", "--position", "2=-30")
     bias = MAP.gx[3, 3], MAP.gy[3, 3]

@@ -40,7 +40,7 @@ def test_table_1_case_c_through_the_command(tmp_path, capsys):
     )
     code, text, _ = run(capsys, table, "--method", "conventional", "-o", out)
     result = json.loads(out.read_text())
-    assert code == 0 and text.startswith("conventional formulation, 1 blocks")
+    assert code == 0 and text.startswith("conventional formulation, 1 block,")
     found = [result[key][0] for key in ("ex_x", "ey_x", "ex_y", "ey_y")]
     np.testing.assert_allclose(found, [-0.0002, 0, 0.1, 0.0002], atol=5e-5)
     assert result["squareness"] == pytest.approx(0.1, abs=5e-5)

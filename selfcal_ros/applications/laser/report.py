@@ -249,8 +249,9 @@ def summary(result: dict[str, Any]) -> str:
             if key not in ("squareness", "straightness_x", "straightness_y")
         ]
     lines = [
-        f"{result['method']} formulation, {result['n_blocks']} blocks, "
-        f"{len(result['diagonals'])} diagonals, {counted(result['n_repeats'], 'repeat')}"
+        f"{result['method']} formulation, "
+        f"{counted(result['n_blocks'], 'block')}, {counted(len(result['diagonals']), 'diagonal')}, "
+        f"{counted(result['n_repeats'], 'repeat')}"
     ]
     lines += [
         f"  {key:22s} {in_um(result[key], result.get(f'u_{key}'))}" for key in names

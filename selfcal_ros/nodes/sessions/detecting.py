@@ -6,6 +6,7 @@ from typing import Any
 
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level, Ports
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.units import MS_PER_S
 from selfcal_ros.vision.exposures import ImageDetector
@@ -69,5 +70,7 @@ class DetectingSession:
                 Level.WARN, f"no mark in the last {self._empty} images{why}", values
             )
         return Diagnosis(
-            Level.OK, f"{counts.marks} marks in {counts.images} images", values
+            Level.OK,
+            f"{counted(counts.marks, 'mark')} in {counted(counts.images, 'image')}",
+            values,
         )

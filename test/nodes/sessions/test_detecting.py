@@ -58,7 +58,7 @@ def test_detections_have_frame_and_stamp_of_their_image(desk):
     assert output == "detection"
     assert fields["header"] == {"stamp": {"sec": 3, "nanosec": 5}, "frame_id": "f"}
     found = desk.session.diagnosis()
-    assert (found.level, found.message) == (Level.OK, "1 marks in 1 images")
+    assert (found.level, found.message) == (Level.OK, "1 mark in 1 image")
     assert float(found.values["ms_per_image_max"]) > 0
     # since the last one
     assert "ms_per_image_max" not in desk.session.diagnosis().values
