@@ -21,7 +21,7 @@ from selfcal_ros.collection.inputs import (
     Phase,
     Reason,
 )
-from selfcal_ros.errors import InputError, printable
+from selfcal_ros.errors import printable
 from selfcal_ros.estimation.checks.wiring import (
     sign_of_lines_is_shown,
     wiring_error,
@@ -54,6 +54,8 @@ MOST_KEPT = 100
 """Names of statuses, and of joints, that are kept: whoever publishes can make up names for ever."""
 REVISIT_S = 10.0
 """Time within which a cell must revisit a missing mark."""
+BACK_S = 0.01
+"""Least step of a clock that is told: that of a simulated one may stand still."""
 OLDEST_S = 10.0
 """Largest age of a detection for a valid stamp of exposure."""
 COVERED = {
@@ -435,20 +437,19 @@ class CellCheck:
         return self._send(Phase.MEASURE, view)
 
     def _send(self, phase: Phase, view: View | None = None) -> Command:
-        """Send a command of its own run, stamped now.
+        """Send a command of its own run, stamped now, or after the last if a clock was set back.
 
-        Raises
-        ------
-        InputError
-            If the clock was set back: the cell would take the command for one of before.
+        A cell takes a command stamped before the last for an old one.
         """
         now_ns = self._ports.now_ns()
         back_s = (self._command.stamp_ns - now_ns) * S_PER_NS
-        if back_s > 0:
-            raise InputError(
-                "clock of this machine",
-                f"it was set back by {back_s:.3g} s or more during the check",
-                "synchronise it first",
+        if back_s > BACK_S and all(item.name != "clock" for item in self.items):
+            self._tell(
+                "clock",
+                False,
+                f"the clock of this machine was set back by {back_s:.3g} s or more: the "
+                "commands are ahead of it",
+                "synchronise it first, and check again",
             )
         stamp = max(now_ns, self._command.stamp_ns + 1)
         begins = phase is Phase.PLACE or not self._command.run_id
@@ -741,7 +742,10 @@ class CellCheck:
         slopes = {
             "x": slope_of(view.motion, 0),
             "y": slope_of(view.motion, 1),
-            "theta": slope_of(view.motion_theta, 0),
+            # of noise alone it may be any
+            "theta": slope_of(view.motion_theta, 0)
+            if sign_of_lines_is_shown(measurements)
+            else None,
         }
         figure = ", ".join(
             f"{axis} {slope:+.3f}"
