@@ -134,6 +134,13 @@ def test_an_encoder_with_best_effort_is_recorded(graph, tmp_path):
     recorder.close()
 
 
+def test_a_recorder_does_nothing_more_often_than_once_a_second(graph, tmp_path):
+    """A timer without a period keeps a core busy."""
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
+    assert min(timer.timer_period_ns for timer in recorder.timers) >= 10**8
+    recorder.close()
+
+
 def test_an_encoder_that_comes_back_with_best_effort_is_recorded(graph, tmp_path):
     recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
     first = graph.publisher(names.ENCODER)
