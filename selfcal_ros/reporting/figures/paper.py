@@ -50,6 +50,10 @@ RC: dict[Any, Any] = {
 """Settings of every picture; the fixed salt makes SVG files repeatable."""
 
 
+MARGIN = 0.02
+"""Share of a picture that is left free at each edge: a page has margins, a file has not."""
+
+
 def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
     """Write a drawing to `path` as PNG, SVG or PDF by its ending, atomically.
 
@@ -78,7 +82,8 @@ def figure(drawing: Drawing) -> Figure:
         page = Figure(
             figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH)
         )
-        put(drawing, page.add_axes((0, 0, 1, 1)), 1.0)
+        inner = 1 - 2 * MARGIN
+        put(drawing, page.add_axes((MARGIN, MARGIN, inner, inner)), inner)
     return page
 
 

@@ -34,6 +34,15 @@ def test_png_of_any_size(tmp_path, size, lines):
     assert list(tmp_path.iterdir()) == [tmp_path / "map.png"]
 
 
+def test_what_is_drawn_at_the_edge_of_a_figure_has_a_margin_in_a_file(tmp_path):
+    drawing = Drawing("corner", "", 200, 100)
+    drawing.label(0, 16, "Title", size=13, bold=True)
+    save_picture(drawing, tmp_path / "corner.png")
+    pixels = imread(tmp_path / "corner.png")[..., :3]
+    columns = np.flatnonzero((pixels < 0.5).any(axis=(0, 2)))
+    assert 0.015 < columns[0] / pixels.shape[1] < 0.04
+
+
 def test_the_picture_holds_the_figures_of_the_report_beside_each_other():
     """That the same input gives the same bytes is tested with the verb, for every form."""
     result, truth = known_result(5, 8)
