@@ -257,6 +257,7 @@ class CellCheck:
             self.done = next(self._script, self) is self
         except Exception as error:
             self.done = True
+            self._send(Phase.ABORT)  # else the cell might go on measuring
             self._tell(
                 "check",
                 False,

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.model.readings import RepeatMotion
 from selfcal_ros.nodes.sessions import cell_check
 from selfcal_ros.nodes.sessions.cell_check import (
@@ -412,6 +413,22 @@ def test_a_slope_of_theta_is_told_where_it_is_one(monkeypatch, slope, dof, told)
     view = SimpleNamespace(motion=None, motion_theta=motion)
     check._judge_wiring(SimpleNamespace(views=[view]), stops=5)
     assert ("theta" in check.items[-1].figure) == told
+
+
+def test_a_check_that_an_error_ends_aborts_the_view():
+    hands = Hands()
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), hands.ports)
+
+    def script():
+        check._send(Phase.MEASURE, check.view)
+        raise RuntimeError("lost")
+        yield
+
+    check._script = script()
+    with pytest.raises(RuntimeError):
+        check.tick()
+    phases = [command["phase"] for command in hands.of("command")]
+    assert phases == [MEASURE, ABORT] and check.done
 
 
 def test_a_few_exposures_while_the_stage_moves_are_no_wrong_unit():
