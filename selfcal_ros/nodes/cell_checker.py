@@ -8,6 +8,7 @@ takes the parameters of measurement_collector, and writes a line of JSON to stdo
 
 import json
 import sys
+import time
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -25,6 +26,8 @@ from selfcal_ros.nodes.sessions.health import Level
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.settings.nodes import CollectorSettings
 
+SENT_S = 0.3
+"""Time in which the middleware, in threads of its own, has sent a last command."""
 OF_A_CELL = ("cell_driver", "mark_detector")
 """Nodes of this package that are part of a cell."""
 
@@ -99,6 +102,12 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         if self.session.done:
             good = all(item.passed for item in self.session.items)
             self._end(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED)
+
+    def close(self) -> None:
+        """Abort what a signal interrupts."""
+        if not self.session.done:
+            self.session.end()
+            time.sleep(SENT_S)
 
     def _end(self, code: ExitCode) -> None:
         self.exit_code = code

@@ -367,6 +367,10 @@ def test_a_sequencer_beside_it_is_refused(graph):
     graph.until(node.finished.done, "the refusal")
     assert node.exit_code == ExitCode.BAD_INPUT
     assert node.session.items == []
+    sent = []
+    node._outputs["command"] = sent.append
+    node.close()  # without a word to the cell, which the other commands
+    assert sent == []
 
 
 def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):

@@ -256,8 +256,7 @@ class CellCheck:
         try:
             self.done = next(self._script, self) is self
         except Exception as error:
-            self.done = True
-            self._send(Phase.ABORT)  # else the cell might go on measuring
+            self.end()
             self._tell(
                 "check",
                 False,
@@ -265,6 +264,13 @@ class CellCheck:
                 "correct what the error names, and check again",
             )
             raise
+
+    def end(self) -> None:
+        """Abort the view, unless the check is over: else the cell goes on measuring."""
+        if not self.done:
+            self.done = True
+            if self._command.run_id:  # else nothing was begun, and another may measure
+                self._send(Phase.ABORT)
 
     def _run_and_diagnosed(self) -> Steps[None]:
         """Check the cell, then tell which nodes are in error at the end."""

@@ -429,6 +429,8 @@ def test_a_check_that_an_error_ends_aborts_the_view():
         check.tick()
     phases = [command["phase"] for command in hands.of("command")]
     assert phases == [MEASURE, ABORT] and check.done
+    check.end()
+    assert len(hands.of("command")) == 2
 
 
 def test_a_few_exposures_while_the_stage_moves_are_no_wrong_unit():
