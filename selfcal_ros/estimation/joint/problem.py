@@ -210,8 +210,8 @@ ROUNDING = 16 * np.finfo(float).eps
 """Noise below this part of the largest deviation is rounding."""
 
 LEAST_NOISE_RAD = 1e-9
-"""Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all
-that is assumed."""
+"""Noise of lines that counts at least, 0.05 nm at 50 mm: exact lines would outweigh all that is
+assumed, and contradict what a stage beside its targets changes."""
 
 LEAST_OF_MARKS = 0.01
 """The same as a part of the noise of marks at the half width: a hundred marks show the turn of a
@@ -668,7 +668,7 @@ def angular_part(problem: Problem) -> AngularPart:
         problem.repeats_theta,
         sigma_of(total, dof),
         problem.angular.sigma_declared,
-        floor=FLOOR,
+        floor=LEAST_NOISE_RAD,
     )
     return AngularPart(*angular.reduced(y), noise)
 

@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which noise counts, and when residuals contradict it."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binom
 from scipy.stats import f as f_distribution
 
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.problem import F_LEVEL, noise_estimate
+from selfcal_ros.model.artifact import Artifact
+from test.support.options import bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 NAN = float("nan")
 
@@ -97,3 +104,26 @@ def test_nothing_to_compare_is_no_contradiction():
         assert np.isnan(found.p) and not found.contradicted
     assert noise_estimate((0.0, 40), (1e-8, 9), NAN, floor=1e-13).sigma == 1e-8
     assert noise_estimate((NAN, 0), (1e-8, 9), NAN).k == pytest.approx(2.32, abs=0.01)
+
+
+@pytest.mark.parametrize(("shared_rad", "is_compared"), [(3e-10, False), (3e-9, True)])
+def test_noise_of_lines_that_counts_nowhere_contradicts_nothing(
+    shared_rad, is_compared
+):
+    """What 20 nm beside the targets change in the angle is 1e-10 rad, the same in all repeats."""
+    artifact = Artifact(7, 0.01, 24)
+    rng = np.random.default_rng(1)
+    readings = simulate_measurements(
+        random_truth(artifact, 4, rng),
+        hu_plan(artifact, 5),
+        rng,
+        sigma_m=2e-8,
+        sigma_theta_rad=shared_rad / 3,
+    )
+    views = tuple(
+        replace(view, dtheta=view.dtheta + rng.normal(0, shared_rad, len(view.dtheta)))
+        for view in readings.views
+    )
+    result = calibrate(replace(readings, views=views), bare())
+    assert bool(result.noise.p_theta < F_LEVEL) is is_compared
+    assert math.isnan(result.noise.p_theta) is not is_compared
