@@ -106,7 +106,7 @@ def test_nothing_to_compare_is_no_contradiction():
     assert noise_estimate((NAN, 0), (1e-8, 9), NAN).k == pytest.approx(2.32, abs=0.01)
 
 
-@pytest.mark.parametrize(("shared_rad", "is_compared"), [(3e-10, False), (3e-9, True)])
+@pytest.mark.parametrize(("shared_rad", "is_compared"), [(3e-10, False), (3e-8, True)])
 def test_noise_of_lines_that_counts_nowhere_contradicts_nothing(
     shared_rad, is_compared
 ):
