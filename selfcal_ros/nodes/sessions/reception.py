@@ -8,7 +8,7 @@ and a few per minute at rest: an encoder at 1 kHz would write 15 GB a day.
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
 
@@ -83,7 +83,7 @@ class Reception:
         self._worker: Executor | None = None
         self._restoring: Future[ResumedRun] | None = None
         self._source = ""  # the journal being resumed
-        self._frames: dict[str, str] = {}  # topic -> of its newest message
+        self._frame = ""  # of the newest detection
         self._bad: Counter = Counter()
         self._decoders = {
             topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
@@ -149,8 +149,9 @@ class Reception:
         While a journal is being resumed, messages are written and held back.
         """
         adopted, came, self._waiting, self._n_detections = False, self._waiting, [], 0
-        newest = {topic: data for topic, data, _, _ in came}
-        self._frames |= {topic: frame_id(data) for topic, data in newest.items()}
+        detections = [data for topic, data, _, _ in came if topic == DETECTION_TOPIC]
+        if detections:
+            self._frame = frame_id(detections[-1])
         waiting = self._believable(came)
         self._advance()
         self._write(waiting)
@@ -278,19 +279,15 @@ class Reception:
             diagnosis = Diagnosis(
                 Level.WARN, f"reading the journal {self._source}", diagnosis.values
             )
-        return merged(diagnosis, self._frame_diagnoses())
-
-    def _frame_diagnoses(self) -> Iterator[Diagnosis]:
-        """Yield a WARN of each topic in another frame than the stage's; "" states none."""
         stage_frame = self.session.settings.frame_id
-        for topic, frame in sorted(self._frames.items()):
-            if frame not in ("", stage_frame):
-                yield Diagnosis(
-                    Level.WARN,
-                    f"{topic} names the frame '{printable(frame)}', but is used in "
-                    f"{stage_frame!r}: transform it first, or set frame_id if it is the "
-                    "stage's",
-                )
+        if self._frame in ("", stage_frame):
+            return diagnosis
+        # joint states have none: broadcasters name there the base of their robot
+        other_frame = (
+            f"{DETECTION_TOPIC} names the frame '{printable(self._frame)}', but is used "
+            f"in {stage_frame!r}: transform it first, or set frame_id if it is the stage's"
+        )
+        return merged(diagnosis, [Diagnosis(Level.WARN, other_frame)])
 
     def close(self) -> None:
         """Take waiting messages, and close the journal."""

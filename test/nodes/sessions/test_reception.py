@@ -865,7 +865,7 @@ def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
 
 
 @pytest.mark.parametrize("frame", ["stage", "", "camera\x1b"])
-def test_a_topic_in_another_frame_is_a_warning_as_long_as_it_is(events, frame):
+def test_detections_in_another_frame_are_a_warning_as_long_as_they_are(events, frame):
     """The readings are used all the same: a driver may know the stage by another name."""
     desk = Desk()
     detection = next(event for event in events if isinstance(event, Detection))
@@ -881,6 +881,11 @@ def test_a_topic_in_another_frame_is_a_warning_as_long_as_it_is(events, frame):
     )
     assert desk.session.collector.received["detection"] == 1
     desk.receive([detection]).reception.drain()
+    assert desk.reception.diagnosis().level == Level.OK
+    # as of a joint state broadcaster: it names the base of its robot
+    sample = next(event for event in events if isinstance(event, EncoderSample))
+    desk.reception.encoder(cdr_of(sample, "base_link"), 0)
+    desk.reception.drain()
     assert desk.reception.diagnosis().level == Level.OK
 
 
