@@ -149,8 +149,9 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the noise to use: declared, else repeats, else residuals.
 
-    If a test contradicts this choice, the larger one is used. Repeats that are identical, but for
-    rounding, show the resolution of the sensor, not the noise, and are ignored.
+    If a test contradicts this choice, or both are too small to be tested, the larger one is used.
+    Repeats that are identical, but for rounding, show the resolution of the sensor, not the noise,
+    and are ignored.
 
     Parameters
     ----------
@@ -159,7 +160,7 @@ def noise_estimate(
     declared : float
         As declared by the detections; NaN = not declared.
     floor : float
-        Noise at the level of rounding, which is not tested.
+        Noise up to which nothing is tested: of rounding, or that counts nowhere.
     """
     if residuals[1] < 1:  # terms with sizes leave fractions of rounding
         residuals = (float("nan"), 0.0)
@@ -186,7 +187,9 @@ def noise_estimate(
         declared=declared,
         p=p,
     )
-    if estimate.contradicted:
+    both = base[1] > 0 and residuals[1] > 0
+    untested = both and max(base[0], residuals[0]) <= floor
+    if estimate.contradicted or untested:
         sigma, dof = max(base, residuals)
         return replace(estimate, sigma=sigma, dof=dof)
     if np.isfinite(declared):

@@ -104,6 +104,9 @@ def test_nothing_to_compare_is_no_contradiction():
         assert np.isnan(found.p) and not found.contradicted
     assert noise_estimate((0.0, 40), (1e-8, 9), NAN, floor=1e-13).sigma == 1e-8
     assert noise_estimate((NAN, 0), (1e-8, 9), NAN).k == pytest.approx(2.32, abs=0.01)
+    for repeats, residuals in ((0.0, 4e-14), (4e-14, 3e-14)):
+        found = noise_estimate((repeats, 40), (residuals, 9), NAN, floor=1e-13)
+        assert found.sigma == 4e-14
 
 
 @pytest.mark.parametrize(("shared_rad", "is_compared"), [(3e-10, False), (3e-8, True)])
