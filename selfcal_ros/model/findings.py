@@ -85,6 +85,10 @@ def _name_of(kind: type) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
 
 
+def _own_fields(kind: type[Found]) -> set[str]:
+    return {item.name for item in fields(kind)} - {item.name for item in fields(Found)}
+
+
 class Finding(Found):
     """Something found in the readings; each kind is a class of its own."""
 
@@ -96,8 +100,7 @@ class Finding(Found):
     @property
     def details(self) -> dict[str, Any]:
         """What the kind has besides size and location, as in results."""
-        own_fields = {item.name for item in fields(self)}
-        own_fields -= {item.name for item in fields(Found)}
+        own_fields = _own_fields(type(self))
         return {
             name: value for name, value in asdict(self).items() if name in own_fields
         }
@@ -638,8 +641,9 @@ def finding_from_dict(data: Any) -> Finding:
     name = read(str, finding["name"])
     details = read(dict, finding.get("details", {}))
     kind = {_name_of(kind): kind for kind in _kinds_of(Finding)}.get(name)
-    if kind is not None:
-        with contextlib.suppress(KeyError, ValueError):  # written by another version
+    # of another version: what its class has no place for would be lost
+    if kind is not None and details.keys() <= _own_fields(kind):
+        with contextlib.suppress(KeyError, ValueError):
             return read(kind, finding | details)
     return read(InWords, finding | {"kind": name, "data": details})
 

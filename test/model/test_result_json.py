@@ -340,6 +340,9 @@ def test_findings_come_back_as_what_they_are():
         ("of_a_later_version", {"x": [1, 2]}),
         ("noise_contradicted", {"stated": 1e-8}),  # and what is declared was lost
         ("few_read", {"unknown": None, "cells": [{"cell": "?"}]}),
+        ("repeats_contradict", {"rejected": 3, "of": 9, "of_a_later_version": 1}),
+        # of an earlier one, with the data of the cause among its own
+        ("taken_for_slip", {"cause": "drift", "slip_in": "a", "part": "x P1"}),
     ],
 )
 def test_a_finding_that_is_not_understood_is_kept_in_its_words(name, details):
