@@ -8,11 +8,11 @@ takes the parameters of measurement_collector, and writes a line of JSON to stdo
 
 import json
 import sys
-import time
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.task import Future
 
 from selfcal_ros.errors import ExitCode, InputError
@@ -26,8 +26,8 @@ from selfcal_ros.nodes.sessions.health import Level
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.settings.nodes import CollectorSettings
 
-SENT_S = 0.3
-"""Time in which the middleware, in threads of its own, has sent a last command."""
+PATIENCE_S = 3.0
+"""Longest time for a last command to arrive."""
 OF_A_CELL = ("cell_driver", "mark_detector")
 """Nodes of this package that are part of a cell."""
 
@@ -107,7 +107,10 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         """Abort what a signal interrupts."""
         if not self.session.done:
             self.session.end()
-            time.sleep(SENT_S)
+            topic = self.resolve_topic_name(names.COMMAND.name)
+            for publisher in self.publishers:
+                if publisher.topic_name == topic:
+                    publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
 
     def _end(self, code: ExitCode) -> None:
         self.exit_code = code

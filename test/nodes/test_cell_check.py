@@ -7,6 +7,8 @@ makes it slow, and nothing late.
 
 import json
 import re
+import signal
+import subprocess
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -371,6 +373,30 @@ def test_a_sequencer_beside_it_is_refused(graph):
     node._outputs["command"] = sent.append
     node.close()  # without a word to the cell, which the other commands
     assert sent == []
+
+
+def test_an_interrupted_check_aborts_its_view(graph, ros_environment, tmp_path):
+    """Between PLACE and MEASURE, where the check itself sends no ABORT."""
+    plan, phases = plan_file(tmp_path, small_plan()), []
+    graph.hand.create_subscription(
+        names.COMMAND.type,
+        names.COMMAND.name,
+        lambda message: phases.append(to_model.command(message).phase),
+        names.COMMAND.qos,
+    )
+    with (
+        process("selfcal_ros.nodes.stage_simulator", [], ros_environment),
+        process(
+            "selfcal_ros.nodes.cell_checker",
+            [plan, "60", "60"],
+            ros_environment,
+            stdout=subprocess.DEVNULL,
+        ) as checker,
+    ):
+        graph.until(lambda: phases, "PLACE")
+        checker.send_signal(signal.SIGINT)
+        graph.until(lambda: len(phases) > 1, "ABORT")
+    assert phases == [Phase.PLACE, Phase.ABORT]
 
 
 def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):
