@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from math import degrees, isfinite, nan, pi, radians
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,9 @@ STILL = 0.25
 
 FOLLOWS = 0.9
 """Fraction of the variance of an offset that must follow the stage for a valid slope."""
+NEAR_FACTOR = 4.0
+"""Factor by which the response of an offset to the stage may differ from -1: a wrong unit makes at
+least 10, a turn or a wrong size of a pixel less."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +67,19 @@ def explaining(
     if standing is not None:
         return standing
     total = sum(isinstance(event, Detection) for event in events)
-    used, *_, seen = _outcome(Fault("", "", command, tuple(events)), settings)
+    recorded = _outcome(Fault("", "", command, tuple(events)), settings)
     faults: list[Fault] = []
-    best: tuple[float, ...] = ((used + total) / 2, -np.inf, 0, 0)
+    best = Outcome((recorded.used + total) / 2, -np.inf, 0, 0)
     for fault in _faults(command, events, settings):
         try:
             outcome = _outcome(fault, settings)
         except InputError:  # an even and an odd side do not lie so
             continue
-        if outcome[-1] < seen:  # without ids, positions in mm are all those of one mark
+        # without ids, positions in mm are all those of one mark
+        if outcome.seen < recorded.seen:
             continue
-        if outcome[2] == 0:  # any offset is small enough in another unit
+        # any offset is small enough in another unit
+        if not outcome.following:
             continue
         if outcome > best:
             faults = []
@@ -91,20 +97,29 @@ def explaining(
     )
 
 
-def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int, int]:
-    """Return what would be without a fault.
+class Outcome(NamedTuple):
+    """What messages are worth, the more the better.
 
-    Returns
-    -------
-    used : int
+    Attributes
+    ----------
+    used : float
         Detections that would be used.
-    faults : int
+    faults : float
         Minus the faults of the offsets.
     following : int
         Of x and y, how many offsets follow the stage; 2 if no check stops show it.
     seen : int
         Marks and lines seen.
     """
+
+    used: float
+    faults: float
+    following: int
+    seen: int
+
+
+def _outcome(fault: Fault, settings: CollectorSettings) -> Outcome:
+    """Return what the messages would be worth without a fault."""
     collector = Collector(settings)
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
@@ -135,12 +150,15 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int, 
     measurements, progress = collector.collect()
     views = measurements.views
     slopes = [slope_of(view.motion, axis) for view in views for axis in (0, 1)]
-    following = sum(slope is not None and -4 < slope < -0.25 for slope in slopes)
-    return (
-        sum(view.used for view in views),
-        -len(wiring_faults(measurements)),
-        following if any(view.check_done for view in progress.values()) else 2,
-        sum(len(view.m) + len(view.k) for view in views),
+    following = sum(
+        slope is not None and 1 / NEAR_FACTOR < -slope < NEAR_FACTOR for slope in slopes
+    )
+    has_stops = any(view.check_done for view in progress.values())
+    return Outcome(
+        used=sum(view.used for view in views),
+        faults=-len(wiring_faults(measurements)),
+        following=following if has_stops else 2,
+        seen=sum(len(view.m) + len(view.k) for view in views),
     )
 
 
@@ -387,7 +405,11 @@ def _other_origin(
 ) -> tuple[int, int]:
     """Return by how much m and n are usually higher than those of the mark at the axis."""
     view, plate = command.view, command.artifact
-    marks = [one for one in detections if one.kind == Kind.GRID and one.has_id]
+    marks = [
+        detection
+        for detection in detections
+        if detection.kind == Kind.GRID and detection.has_id
+    ]
     if view is None or plate is None or plate.marks or not marks:
         return 0, 0
     at = _places_at(samples, marks, settings)
@@ -417,7 +439,8 @@ def _places_at(
     if not places:
         return np.full(len(detections), np.nan + 0j)
     stamps, at = zip(*places, strict=True)
-    return np.interp([one.stamp_ns for one in detections], stamps, at)
+    exposed_ns = [detection.stamp_ns for detection in detections]
+    return np.interp(exposed_ns, stamps, at)
 
 
 def _other_zero(
