@@ -57,6 +57,8 @@ EXTRAS = {
     "weasyprint": "pdf",
 }
 """Modules that are imported where they are used, and the extra that installs each."""
+PACKAGES = {"PIL": "pillow", "yaml": "pyyaml"}
+"""Modules whose package has another name."""
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
@@ -208,7 +210,9 @@ def _remedy(module: str | None) -> str:
 
     extra = EXTRAS.get(module or "")
     return NEEDED.get(module or "") or (
-        f"pip install 'selfcal_ros[{extra}]'" if extra else f"pip install {module}"
+        f"pip install 'selfcal_ros[{extra}]'"
+        if extra
+        else f"pip install {PACKAGES.get(module or '', module)}"
     )
 
 

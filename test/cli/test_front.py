@@ -209,6 +209,7 @@ def test_a_module_that_is_missing_is_named_with_the_extra_that_installs_it(
     for module, remedy in (
         ("pymmcore", "pip install 'selfcal_ros[micromanager]'"),
         ("vendor", "pip install vendor"),
+        ("yaml", "pip install pyyaml"),
         (
             "rclpy",
             "source a ROS 2 installation, or use the environment of `make setup`",
