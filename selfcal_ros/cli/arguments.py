@@ -124,9 +124,7 @@ def check_existing(args: argparse.Namespace) -> None:
     InputError
         If the file of an output exists, or its name is that of another kind of file.
     """
-    from selfcal_ros.outputs import (
-        refuse_existing,
-    )  # with numpy, which help does without
+    from selfcal_ros.outputs import refuse_existing  # with numpy
 
     inputs = {os.path.realpath(item.path) for item in _files(args)}
     for action in _outputs(args.leaf):

@@ -325,9 +325,8 @@ def _modes(number: int) -> str:
 
 def size_text(check: TermCheck) -> str:
     """Return the size of a term in a person's unit."""
-    is_turn = block_of(
-        check.name
-    ).of_microscope  # as large as its scale, and shown for it
+    # of a microscope the turn is shown, which is as large as the scale
+    is_turn = block_of(check.name).of_microscope
     unit = MRAD if is_turn else unit_of(check.name, check.unit)
     return f"{check.size * unit.per_si:.6g} {unit.name}"
 

@@ -19,6 +19,7 @@ from selfcal_ros.collection.clock_steps import ClockStep
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level, Ports
+from selfcal_ros.outputs import FULL
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import S_PER_H
@@ -26,7 +27,7 @@ from selfcal_ros.units import S_PER_H
 RETRY_S = 10.0
 """Time after which opening a journal is retried, and time without failure after which a failure
 is over."""
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+NO_ROOM = (*FULL, errno.EIO, errno.EROFS)
 """Errors of the disk that may pass; others are due to the parameter."""
 
 

@@ -55,7 +55,7 @@ from selfcal_ros.model.findings import (
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.reporting.summary.numbers import p_text
+from selfcal_ros.reporting.summary.numbers import counted, p_text
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -528,8 +528,7 @@ def _(finding: OutliersRemoved) -> str:
     )
     n_more = finding.number - len(finding.first)
     more = f" and {n_more} more" if n_more > 0 else ""
-    plural = "s" * (finding.number != 1)
-    return f"removed {finding.number} outlier{plural}: {named}{more}"
+    return f"removed {counted(finding.number, 'outlier')}: {named}{more}"
 
 
 @sentence_of.register

@@ -35,6 +35,7 @@ from selfcal_ros.model.findings import (
 )
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import View
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.units import MM_PER_M
 
 NAMED = 4
@@ -195,8 +196,7 @@ def _(mode: LinesNeverVisited) -> str:
 
 @mode_text.register
 def _(mode: LooksLikeStage) -> str:
-    modes = f"{mode.count} mode{'s' * (mode.count != 1)}"
-    return f"{mode.term}: {modes} of the stage look like it"
+    return f"{mode.term}: {counted(mode.count, 'mode')} of the stage look like it"
 
 
 @mode_text.register

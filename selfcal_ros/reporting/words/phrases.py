@@ -35,7 +35,7 @@ from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
-from selfcal_ros.reporting.summary.numbers import p_text
+from selfcal_ros.reporting.summary.numbers import counted, p_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {
@@ -79,7 +79,7 @@ def counted_views(
     )
     images = f" with images of {cells} marks" if cells else ""
     share = f"{meant} of " * (meant != number)
-    return f"{share}{number} view{'s' * (number != 1)}{images}"
+    return f"{share}{counted(number, 'view')}{images}"
 
 
 def few_read_text(finding: FewRead) -> str:
