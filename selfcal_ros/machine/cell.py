@@ -167,24 +167,8 @@ def read_cell(path: str | Path) -> Cell:
     path = Path(path)
     where = str(path)
     data = _mapping(read_yaml(path), where)
-    if not isinstance(data.get("machine"), str):
-        raise InputError(
-            where,
-            "the key 'machine' is missing",
-            f"name a machine: {', '.join(known_machines())}, or package.module:Class",
-        )
-    machine = data["machine"]
+    machine = _machine(data.get("machine"), where)
     machine_key = machine.rpartition(":")[2]
-    if (
-        ":" not in machine
-        and machine not in SHIPPED
-        and machine not in known_machines()
-    ):
-        raise InputError(
-            f"{where}: machine",
-            f"there is no machine '{machine}'",
-            f"{known_are(machine, sorted(known_machines()))}; or package.module:Class",
-        )
     known_keys = (
         "machine",
         machine_key,
@@ -197,41 +181,15 @@ def read_cell(path: str | Path) -> Cell:
         "found",
     )
     _only(data, known_keys, where)
-    limits = {}
-    for axis, pair in _mapping(data.get("limits", {}), f"{where}: limits").items():
-        limits[axis] = _pair(pair, f"{where}: limits: {axis}")
-    _only(limits, AXES, f"{where}: limits")
-    for axis in AXES[:2]:
-        if max(map(abs, limits.get(axis, (0.0,)))) > LONGEST_M:
-            raise InputError(
-                f"{where}: limits: {axis}", f"{limits[axis]} m: is it in mm?", "give m"
-            )
-    for axis in ("x", "y"):
-        if axis not in limits:
-            raise InputError(
-                f"{where}: limits",
-                f"the travel of {axis} is not limited",
-                f"give {axis}: [low, high] in m, as the machine indicates them",
-            )
     sense = Parameter(
         "sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense))
     )
-    placing_keys = _mapping(
-        data.get("placing") if isinstance(data.get("placing"), dict) else {}, where
-    )
-    _only(placing_keys, ("command",), f"{where}: placing")
-    placing = (
-        "robot"
-        if placing_keys
-        else Parameter("placing", "person", "", choices=PLACERS).check(
-            data.get("placing", "person"), where
-        )
-    )
+    placing, place_command = _placing(data.get("placing", "person"), where)
     return Cell(
         path,
         machine,
         _mapping(data.get(machine_key, {}), f"{where}: {machine_key}"),
-        limits,
+        _limits(data.get("limits", {}), f"{where}: limits"),
         origin=_numbers(
             data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)
         ),
@@ -246,8 +204,57 @@ def read_cell(path: str | Path) -> Cell:
         ),
         detector=_detector(data["detector"], where) if "detector" in data else None,
         placing=placing,
-        place_command=str(placing_keys.get("command", "")),
+        place_command=place_command,
     )
+
+
+def _machine(name: Any, where: str) -> str:
+    """Return the name of a machine that there is, or ``package.module:Class``."""
+    known = sorted(known_machines())
+    if not isinstance(name, str):
+        raise InputError(
+            where,
+            "the key 'machine' is missing",
+            f"name a machine: {', '.join(known)}, or package.module:Class",
+        )
+    if ":" not in name and name not in known:
+        raise InputError(
+            f"{where}: machine",
+            f"there is no machine '{name}'",
+            f"{known_are(name, known)}; or package.module:Class",
+        )
+    return name
+
+
+def _limits(data: Any, where: str) -> dict[str, tuple[float, float]]:
+    """Return the limits of the axes; those of x and y must be given."""
+    limits = {
+        axis: _pair(pair, f"{where}: {axis}")
+        for axis, pair in _mapping(data, where).items()
+    }
+    _only(limits, AXES, where)
+    for axis in AXES[:2]:
+        if axis not in limits:
+            raise InputError(
+                where,
+                f"the travel of {axis} is not limited",
+                f"give {axis}: [low, high] in m, as the machine indicates them",
+            )
+        if max(map(abs, limits[axis])) > LONGEST_M:
+            raise InputError(
+                f"{where}: {axis}", f"{limits[axis]} m: is it in mm?", "give m"
+            )
+    return limits
+
+
+def _placing(data: Any, where: str) -> tuple[str, str]:
+    """Return who places the plate, and the command line of a robot, "" without one."""
+    if isinstance(data, dict) and data:
+        _only(data, ("command",), f"{where}: placing")
+        command = Parameter("command", "", "")
+        return "robot", command.check(data["command"], f"{where}: placing")
+    placing = Parameter("placing", "person", "", choices=PLACERS)
+    return placing.check(data, where), ""
 
 
 def _detector(data: Any, where: str) -> DetectorSettings:

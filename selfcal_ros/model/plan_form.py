@@ -80,21 +80,12 @@ def plan_from_dict(data: object, where: str) -> Plan:
         harmonics=harmonics_of(fields["map"], f"{where}: map"),
     )
     order = _order(fields["visit_order"], where)
-    if len(fields["views"]) > MAX_VIEWS:
-        raise InputError(
-            f"{where}: views",
-            f"{len(fields['views'])} views are more than {MAX_VIEWS}",
-            "measure fewer views",
-        )
-    checks = _checks(fields["check_stops"], f"{where}: check_stops")
-    views = tuple(
-        _view_from_dict(view, f"{where}: views[{index}]", artifact, order)
-        for index, view in enumerate(fields["views"])
-    )
+    views = _views_from_list(fields["views"], where, artifact, order)
     grid = map_grid_of(fields["map"], artifact, f"{where}: map")
     if grid is None and not all(view.is_on_lattice(artifact) for view in views):
         grid = default_map_grid(artifact)
     artifact = replace(artifact, map_grid=grid)
+    checks = _checks(fields["check_stops"], f"{where}: check_stops")
     image = image_of(fields["image"], artifact, f"{where}: image")
     views = tuple(
         replace(
@@ -110,15 +101,6 @@ def plan_from_dict(data: object, where: str) -> Plan:
             f"than {MAX_VIEWS}",
             "state fewer marks in an image",
         )
-    if not views:
-        raise InputError(where, "the plan has no views", "add at least one view")
-    for index, view in enumerate(views):
-        if view.name in [earlier.name for earlier in views[:index]]:
-            raise InputError(
-                f"{where}: views[{index}]",
-                f"the name '{view.name}' is used twice",
-                "give every view its own name",
-            )
     terms = terms_of(fields["model_terms"], where)
     return Plan(
         _name(fields["plan_id"], f"{where}: plan_id"),
@@ -128,6 +110,31 @@ def plan_from_dict(data: object, where: str) -> Plan:
         fields["artifact_from"],
         **{key: fields[key] for key in PLAN_KEYS},
     )
+
+
+def _views_from_list(
+    data: list, where: str, artifact: Artifact, order: str
+) -> tuple[View, ...]:
+    """Return the views of a plan, each with a name of its own; `order` where one has none."""
+    if not data:
+        raise InputError(where, "the plan has no views", "add at least one view")
+    if len(data) > MAX_VIEWS:
+        raise InputError(
+            f"{where}: views",
+            f"{len(data)} views are more than {MAX_VIEWS}",
+            "measure fewer views",
+        )
+    views: dict[str, View] = {}
+    for index, item in enumerate(data):
+        view = _view_from_dict(item, f"{where}: views[{index}]", artifact, order)
+        if view.name in views:
+            raise InputError(
+                f"{where}: views[{index}]",
+                f"the name '{view.name}' is used twice",
+                "give every view its own name",
+            )
+        views[view.name] = view
+    return tuple(views.values())
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:

@@ -213,13 +213,15 @@ def grid_exposures(
     place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
     tau = np.arange(size) / max(size - 1, 1)
     drifted_m = physics.drift(truth, index, tau)
-    stop = stage_targets(truth.artifact, view, visits, settings.sense)
-    # the stage continues until the mark is under the microscope
     if settings.follow_mark:
-        centre = place + drifted_m[:, np.cumsum(visits.count) - visits.count]
+        # the stage continues until the mark is under the microscope
+        first_of_visit = np.cumsum(visits.count) - visits.count
+        centre = place + drifted_m[:, first_of_visit]
         centre = -centre if settings.sense is Sense.PLATE_MOVES else centre
-        stop = centre + physics.stage_error(truth, centre, index)
-    stop = stop + normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
+        target = centre + physics.stage_error(truth, centre, index)
+    else:
+        target = stage_targets(truth.artifact, view, visits, settings.sense)
+    stop = target + normal(rng, settings.stop_sigma_m, target.shape) + visits.aside_m
     came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
     approach = np.stack([approach_signs(row, physics.NO_MOTION_M)[1:] for row in came])
     position = stop[:, visit] + normal(rng, settings.servo_sigma_m, (2, size))
@@ -233,39 +235,45 @@ def grid_exposures(
         sign=physics.motion_sign(np.diff(came, axis=1))[:, visit],
         rested_s=rested * settings.exposure_period_s,
     )
-    machine = (truth, settings.sense, position, stage)
+
+    def seen(mark_place: np.ndarray) -> np.ndarray:
+        """Return what the microscope sees of a mark at each exposure, (2, size), m."""
+        drifted = mark_place[:, visit] + drifted_m
+        return physics.offset_seen(truth, settings.sense, position, stage, drifted)
+
     white = white_noise(rng, settings, size)
     shared = (
         normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
         + _flicker(rng, settings.flicker_xy_m, (2, size))
         + normal(rng, settings.image_xy_m, (2, size))
     )
-    offset = physics.offset_seen(*machine, place[:, visit] + drifted_m) + white + shared
+    offset = quantised(seen(place) + white + shared, settings.resolution_xy_m)
     indicated = position + normal(rng, settings.encoder_sigma_m, (2, size))
     other_cells = []
     for sub in view.sub_views:
         if sub.cell is not None and sub.cell != (0, 0):
-            marks = physics.marks_beside(truth, index, view, (m, n), sub)
-            away = physics.mark_places(
-                truth, index, truth.placed_as(index, view), marks[:2]
-            )[0]
-            cell_offset = physics.offset_seen(*machine, away[:, visit] + drifted_m)
+            m_beside, n_beside, is_mark_beside = physics.marks_beside(
+                truth, index, view, (m, n), sub
+            )
+            place_beside, _ = physics.mark_places(
+                truth, index, truth.placed_as(index, view), (m_beside, n_beside)
+            )
+            white = white_noise(rng, settings, size)
             other_cells.append(
                 Seen(
                     sub.cell,
                     quantised(
-                        cell_offset + white_noise(rng, settings, size) + shared,
-                        settings.resolution_xy_m,
+                        seen(place_beside) + white + shared, settings.resolution_xy_m
                     ),
-                    np.stack(marks[:2]),
-                    is_mark & marks[2],
+                    np.stack([m_beside, n_beside]),
+                    is_mark & is_mark_beside,
                 )
             )
     return GridExposures(
         visits,
         visit,
         indicated,
-        offset=quantised(offset, settings.resolution_xy_m),
+        offset=offset,
         mark=np.stack([m, n]),
         there=is_mark,
         approach=approach,

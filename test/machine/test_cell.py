@@ -79,6 +79,10 @@ def test_a_cell_with_all_its_keys(tmp_path):
         ),
         (f"{LIMITS}machine: simulated\nplacing: hand\n", "choose one of person, robot"),
         (
+            f"{LIMITS}machine: simulated\nplacing: {{command: }}\n",
+            "placing: command: None is not of type str",
+        ),
+        (
             f"{LIMITS}machine: simulated\ndetector: {{autostart: true}}\n",
             "autostart: unknown key",
         ),
