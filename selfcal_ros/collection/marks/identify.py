@@ -125,14 +125,9 @@ def identify_grid(
     rigid = estimate.rigid if fit.marks < 3 else fit.rigid
     far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
     if free.any():
-        nominal = estimate.rigid.undo(centred[:, free])
-        marks[:, free], ratio, distance, apart = _nearest(pose, nominal, artifact)
-        error = estimate.error_at(nominal)
-        reach = TOO_FAR_FROM_ANY * pitch
-        unsure[free] = (error > SURE * pitch) & (distance <= reach + error)
-        ambiguous[free] = (distance <= reach) & ~unsure[free] & (error > SURE * apart)
-        ambiguous[free] |= (distance <= reach) & (ratio > rules.ambiguity_ratio)
-        far[free] = (distance > reach) & ~unsure[free]
+        marks[:, free], far[free], unsure[free], ambiguous[free] = _identified(
+            pose, centred[:, free], artifact, estimate, rules
+        )
     site = np.stack(pose.site_of(*artifact.places(*marks)))
     deviation = reading_m - site * pitch
     about = _about(pose, marks, artifact)
@@ -160,6 +155,29 @@ def identify_grid(
         rigid=rigid,
         phi_error_rad=fit.phi_error_rad,
     )
+
+
+def _identified(
+    pose: StagePose,
+    centred_m: np.ndarray,
+    artifact: Artifact,
+    estimate: rigids.MotionEstimate,
+    rules: IdentityRules,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mark nearest to each reading about the plate's centre, (2, n), and three flags.
+
+    Bool (n,) each: whether there is none, whether the rotation is known too badly to tell, and
+    whether another mark is nearly as near.
+    """
+    nominal = estimate.rigid.undo(centred_m)
+    marks, ratio, distance, apart = _nearest(pose, nominal, artifact)
+    error = estimate.error_at(nominal)
+    reach = TOO_FAR_FROM_ANY * artifact.grid_pitch_m
+    near = distance <= reach
+    unsure = (error > SURE * artifact.grid_pitch_m) & (distance <= reach + error)
+    between = (error > SURE * apart) & ~unsure
+    ambiguous = near & (between | (ratio > rules.ambiguity_ratio))
+    return marks, ~near & ~unsure, unsure, ambiguous
 
 
 def _at_most_two(numbers: np.ndarray) -> bool:
