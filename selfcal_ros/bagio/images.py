@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +200,7 @@ def write_pictures(
     folder : Path
         Folder of the images.
     rows : sequence of Position
-        The exposures, by view.
+        The exposures, one or more, by view.
     plan : Plan
         The plan.
     output : str or Path
@@ -222,90 +222,105 @@ def write_pictures(
     NoDataError
         If a file of the table is not in the folder.
     """
-    missing = [row for row in rows if not (folder / row.file).is_file()]
-    if missing:
-        number = (
-            f" ({len(missing)} of {len(rows)} files are not)"
-            if len(missing) > 1
-            else ""
-        )
-        raise NoDataError(
-            missing[0].where,
-            f"{missing[0].file} is not in {folder}{number}",
-            "correct the table, or name the folder of its images",
-        )
+    _require_files(folder, rows)
     problems: Counter[str] = Counter()
-    latched = qos_profile(reliable=True, transient_local=True, depth=64)
-    volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
-    view = -1
-    now = (
-        rows[0].stamp_ns - STEP_NS
-        if rows and rows[0].stamp_ns is not None
-        else START_NS
-    )
-    run_id = str(now)
-
-    def command(phase: Phase, index: int) -> None:
-        planned = plan.views[index] if index < len(plan.views) else None
-        writer.write(
-            f"/{COMMAND_TOPIC}",
-            from_model.command(
-                Command(
-                    stamp_ns=now,
-                    phase=phase,
-                    plan_id=plan.plan_id,
-                    view_index=index,
-                    view=planned,
-                    artifact=plan.artifact if planned else None,
-                    views_planned=len(plan.views),
-                    run_id=run_id,
-                    model_terms=plan.model_terms,
-                ),
-                frame_id,
-            ),
-            now,
-        )
-
+    first_ns = rows[0].stamp_ns
+    run_id = str(START_NS if first_ns is None else first_ns - STEP_NS)
     with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
-        for topic, typename in INPUT_TOPICS.items():
-            writer.add_topic(
-                f"/{topic}", typename, [latched if topic == COMMAND_TOPIC else volatile]
-            )
-        for row in rows:
-            if row.view != view:
-                view = row.view
-                for phase, before_ns in BEFORE_NS.items():
-                    now = (
-                        now + STEP_NS
-                        if row.stamp_ns is None
-                        else row.stamp_ns - before_ns
-                    )
-                    command(phase, view)
-            now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns
-            for step in BESIDE_NS:
-                sample = EncoderSample(
-                    now + step, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0)
-                )
-                writer.write(
-                    f"/{ENCODER_TOPIC}",
-                    from_model.joint_state(sample, frame_id),
-                    now + step,
-                )
+        bag = _PictureBag(writer, plan, frame_id, run_id)
+        for row, commands, exposed_ns in _timed(rows):
+            for phase, commanded_ns in commands.items():
+                bag.command(phase, row.view, commanded_ns)
+            bag.position(row, exposed_ns)
             try:
-                detections = detect(read_bytes(folder / row.file), row.file, now)
+                detections = detect(read_bytes(folder / row.file), row.file, exposed_ns)
             except InputError as error:
                 problems[str(error)] += 1
-                detections = ()
-            for detection in detections:
-                writer.write(
-                    f"/{DETECTION_TOPIC}",
-                    from_model.detection(detection, frame_id),
-                    now,
-                )
-        now += STEP_NS
-        command(Phase.DONE, len(plan.views))
+            else:
+                bag.detections(detections, exposed_ns)
+        bag.command(Phase.DONE, len(plan.views), exposed_ns + STEP_NS)
         check()
     return problems
+
+
+def _require_files(folder: Path, rows: Sequence[Position]) -> None:
+    """Raise NoDataError if images of the table are not in the folder."""
+    missing = [row for row in rows if not (folder / row.file).is_file()]
+    if not missing:
+        return
+    number = f" ({len(missing)} of {len(rows)} files are not)"
+    raise NoDataError(
+        missing[0].where,
+        f"{missing[0].file} is not in {folder}{number if len(missing) > 1 else ''}",
+        "correct the table, or name the folder of its images",
+    )
+
+
+def _timed(
+    rows: Sequence[Position],
+) -> Iterator[tuple[Position, dict[Phase, int], int]]:
+    """Yield each exposure, the commands before it with their stamps, and its own stamp, ns."""
+    clock = count(START_NS + STEP_NS, STEP_NS)
+    view = -1
+    for row in rows:
+        phases = {} if row.view == view else BEFORE_NS
+        view = row.view
+        if row.stamp_ns is None:
+            yield row, {phase: next(clock) for phase in phases}, next(clock)
+        else:
+            commands = {
+                phase: row.stamp_ns - before_ns for phase, before_ns in phases.items()
+            }
+            yield row, commands, row.stamp_ns
+
+
+class _PictureBag:
+    """Writes what a cell would have published while it took the images."""
+
+    def __init__(
+        self, writer: BagWriter, plan: Plan, frame_id: str, run_id: str
+    ) -> None:
+        """Announce the topics."""
+        self._writer, self._plan = writer, plan
+        self._frame_id, self._run_id = frame_id, run_id
+        latched = qos_profile(reliable=True, transient_local=True, depth=64)
+        volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
+        for topic, typename in INPUT_TOPICS.items():
+            profile = latched if topic == COMMAND_TOPIC else volatile
+            writer.add_topic(f"/{topic}", typename, [profile])
+
+    def command(self, phase: Phase, view_index: int, stamp_ns: int) -> None:
+        """Write a command of the plan."""
+        plan = self._plan
+        in_plan = view_index < len(plan.views)
+        command = Command(
+            stamp_ns=stamp_ns,
+            phase=phase,
+            plan_id=plan.plan_id,
+            view_index=view_index,
+            view=plan.views[view_index] if in_plan else None,
+            artifact=plan.artifact if in_plan else None,
+            views_planned=len(plan.views),
+            run_id=self._run_id,
+            model_terms=plan.model_terms,
+        )
+        message = from_model.command(command, self._frame_id)
+        self._writer.write(f"/{COMMAND_TOPIC}", message, stamp_ns)
+
+    def position(self, row: Position, stamp_ns: int) -> None:
+        """Write the position of a stage at rest."""
+        for step_ns in BESIDE_NS:
+            sample = EncoderSample(
+                stamp_ns + step_ns, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0)
+            )
+            message = from_model.joint_state(sample, self._frame_id)
+            self._writer.write(f"/{ENCODER_TOPIC}", message, stamp_ns + step_ns)
+
+    def detections(self, detections: Iterable[Detection], stamp_ns: int) -> None:
+        """Write the detections in an image."""
+        for detection in detections:
+            message = from_model.detection(detection, self._frame_id)
+            self._writer.write(f"/{DETECTION_TOPIC}", message, stamp_ns)
 
 
 @dataclass
