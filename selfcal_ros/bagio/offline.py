@@ -4,6 +4,7 @@
 import hashlib
 import heapq
 from array import array
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
@@ -103,34 +104,25 @@ def collect_bag(
             f"no topics of the cell '/{cell}'",
             "choose one of " + ", ".join(f"/{name}" for name in sorted(reader.cells)),
         )
-    tail = (
-        f" ({'; '.join(dict.fromkeys(reader.lost[-MAX_SAID:]))})" if reader.lost else ""
-    )
+    lost = "; ".join(dict.fromkeys(reader.lost[-MAX_SAID:]))
+    tail = f" ({lost})" if lost else ""
     for kind, topic in (
         ("command", COMMAND_TOPIC),
         ("detection", DETECTION_TOPIC),
         ("encoder", ENCODER_TOPIC),
     ):
         if not received[kind]:
-            remedy = f"{topics_like(topic, reader.topics)}record this topic too, see the README"
-            if kind == "detection" and any(
-                name.endswith(("/Image", "/CompressedImage"))
-                for name in reader.topics.values()
-            ):
-                remedy = (
-                    f"it has images: find the marks in them with `selfcal detect {path} -o "
-                    "MARKS`, then solve MARKS"
-                )
-            raise NoDataError(str(path), f"no message on {topic}{tail}", remedy)
+            raise NoDataError(
+                str(path),
+                f"no message on {topic}{tail}",
+                _how_to_record(topic, reader.topics, path),
+            )
     if collector.timeline.artifact is None:
+        unusable = f" that can be used{tail}"
         raise NoDataError(
             str(path),
             "no MEASURE command"
-            + (
-                f" that can be used{tail}"
-                if collector.unusable.get(Reason.COMMAND_BAD)
-                else ""
-            ),
+            + (unusable if collector.unusable.get(Reason.COMMAND_BAD) else ""),
             "readings cannot be assigned to views without one",
         )
     measurements, views = collector.collect()
@@ -142,12 +134,8 @@ def collect_bag(
     ]
     findings = [*collector.missing_commands(), *findings]
     if not any(view.used for view in measurements.views):
-        reasons = ", ".join(
-            f"{reason} {count}"
-            for reason, count in sorted(
-                measurements.all_rejected().items(), key=lambda i: -i[1]
-            )[:4]
-        )
+        commonest = Counter(measurements.all_rejected()).most_common(4)
+        reasons = ", ".join(f"{reason} {count}" for reason, count in commonest)
         raise NoDataError(
             str(path),
             f"none of {received['detection']} detections became a reading (rejected: "
@@ -155,6 +143,19 @@ def collect_bag(
             [*clock, *findings, "correct the first cause named"][0],
         )
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
+
+
+def _how_to_record(topic: str, types: dict[str, str], path: str | Path) -> str:
+    """Return the remedy for a topic that a bag with topics of these types does not have."""
+    images = any(
+        name.endswith(("/Image", "/CompressedImage")) for name in types.values()
+    )
+    if topic == DETECTION_TOPIC and images:
+        return (
+            f"it has images: find the marks in them with `selfcal detect {path} -o "
+            "MARKS`, then solve MARKS"
+        )
+    return f"{topics_like(topic, types)}record this topic too, see the README"
 
 
 def _fed(

@@ -61,25 +61,7 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.a, args.b], [args.plot])
     a, second = read_result(args.a), read_json(args.b)
     if isinstance(second, dict) and "ex_x" in second:
-        if args.keep_scale:
-            raise InputError(
-                "--keep-scale",
-                f"for {args.b} squareness and scale difference are compared, not the magnification",
-                "omit it",
-            )
-        for option in ("plot", "artifact"):
-            if getattr(args, option):
-                raise InputError(
-                    f"--{option}", f"{args.b} has no map", "name two RESULT.json"
-                )
-        rows = compare_with_laser(a, second, args.b)
-        say(
-            args,
-            "\n".join([_laser_text(rows), *_grades_text([a])]),
-            {**_laser_json(rows), **_grades([a])},
-        )
-        say_unless_qualified(a, f"selfcal diff: {args.a}")
-        return int(ExitCode.DONE)
+        return _compare_with_laser(args, a, second)
     b = read_result(args.b)
     if args.keep_scale:
         for name, result in ((args.a, a), (args.b, b)):
@@ -98,33 +80,15 @@ def run(args: argparse.Namespace) -> int:
             names=(args.a, args.b),
         )
     if args.plot:
-        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
-
-        map_a, map_b = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
-        save_picture(
-            difference_picture(
-                map_a,
-                map_b,
-                {
-                    "gx": difference.dx,
-                    "gy": difference.dy,
-                    "g_theta": difference.d_theta,
-                },
-                _verdict_text(difference),
-            ),
-            args.plot,
-        )
+        _save_picture(args, a, b, difference)
     say(
         args,
         _text(difference, _grades_text([a, b]), args.artifact),
         {**_json(difference), **_grades([a, b])},
     )
     datums = [result.error_map.datum_theta for result in (a, b)]
-    if (
-        datums[0] != datums[1]
-        and not (args.json or args.artifact)
-        and difference.theta is not None
-    ):
+    of_theta = difference.theta is not None and not args.artifact
+    if of_theta and datums[0] != datums[1] and not args.json:
         print(
             f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
             "lines to the XY axes"
@@ -132,6 +96,50 @@ def run(args: argparse.Namespace) -> int:
     for name, result in ((args.a, a), (args.b, b)):
         say_unless_qualified(result, f"selfcal diff: {name}")
     return int(ExitCode.DONE)
+
+
+def _compare_with_laser(
+    args: argparse.Namespace, result: CalibrationResult, laser: dict[str, Any]
+) -> int:
+    """Compare a map with the diagonals of a laser, and print."""
+    if args.keep_scale:
+        raise InputError(
+            "--keep-scale",
+            f"for {args.b} squareness and scale difference are compared, not the magnification",
+            "omit it",
+        )
+    for option in ("plot", "artifact"):
+        if getattr(args, option):
+            raise InputError(
+                f"--{option}", f"{args.b} has no map", "name two RESULT.json"
+            )
+    rows = compare_with_laser(result, laser, args.b)
+    say(
+        args,
+        "\n".join([_laser_text(rows), *_grades_text([result])]),
+        {**_laser_json(rows), **_grades([result])},
+    )
+    say_unless_qualified(result, f"selfcal diff: {args.a}")
+    return int(ExitCode.DONE)
+
+
+def _save_picture(
+    args: argparse.Namespace,
+    a: CalibrationResult,
+    b: CalibrationResult,
+    difference: MapDifference,
+) -> None:
+    """Draw the difference of two maps, or of two plates."""
+    from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+
+    map_a, map_b = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
+    shown = {
+        "gx": difference.dx,
+        "gy": difference.dy,
+        "g_theta": difference.d_theta,
+    }
+    picture = difference_picture(map_a, map_b, shown, _verdict_text(difference))
+    save_picture(picture, args.plot)
 
 
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from selfcal_ros.applications.papers.methods import calibrate_by
-from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
+from selfcal_ros.bagio.offline import BagSession, bag_input, collect_bag, read_truth
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.cli.terminal import (
     Once,
@@ -28,7 +28,7 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
-from selfcal_ros.errors import InputError, NotIdentifiableError, printable
+from selfcal_ros.errors import InputError, NotIdentifiableError, SelfcalError, printable
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.options import Options
@@ -246,23 +246,8 @@ def run(args: argparse.Namespace) -> int:
             "Hu's law needs every reading and cannot hold any out",
             "solve with --method joint",
         )
-    with progress_bar("reading") as bar:
-        measurements, _, lost, findings = collect_bag(
-            args.bag,
-            collector,
-            namespace=args.namespace,
-            progress=lambda count: bar(count, None),
-        )
-    used = sum(view.used for view in measurements.views)
-    warnings = [
-        *findings,
-        *lost,
-        *(() if findings else rejections(measurements.all_rejected(), used)),
-    ]
-    # a clock step is a finding, and noted in the result
-    for line in dict.fromkeys(warnings):
-        tell(f"selfcal {args.verb}: {args.bag}: {line}", sys.stderr)
-    measurements = _with_map(args, measurements)
+    session = _collected(args, collector)
+    measurements = _with_map(args, session.measurements)
     options = solver_options(
         solver, measurements, plate_from=getattr(args, "plate_from", "")
     )
@@ -278,40 +263,17 @@ def run(args: argparse.Namespace) -> int:
             result = _calibrated(args, measurements, options, method=solver.method)
     except NotIdentifiableError as refused:
         error = with_advice(refused)
-        if (args.output or args.json) and error.observability is not None:
+        if error.observability is not None:
             result = unidentified_result(measurements, error.observability)
-            result = worded(with_places(result, measurements.views))
-            _write(
-                args,
-                result_to_dict(
-                    created_now(with_input(result, bag_input(args.bag), lost))
-                ),
-            )
-        # a fault of the cell: a plate placed otherwise, a wrong sign
-        if set(findings) - set(lost):
-            raise InputError(
-                args.bag, "correct this first", f"as it is, {error}"
-            ) from refused
-        if findings:  # missing readings look like a deficient plan
-            raise NotIdentifiableError(
-                f"{args.bag}: correct this first; as it is, {error}",
-                error.observability,
-            ) from refused
-        raise
-    if (
-        options.plate is not None
-        and options.plate.input.get("sha256") == bag_input(args.bag)["sha256"]
-    ):
-        raise InputError(
-            args.bag,
-            f"the recording that {options.plate_from} was computed from: it would be "
-            "compared with itself",
-            "record a new view of the plate",
-        )
+            result = with_places(result, measurements.views)
+            _write(args, _described(args, result, session.lost))
+        raise _first_fault(args.bag, error, session) from refused
+    if options.plate is not None:
+        _require_other_recording(args.bag, options.plate, options.plate_from)
     with busy("validating"):
         result, lines = _validated(args, measurements, options, result)
-    result = created_now(with_input(worded(result), bag_input(args.bag), lost))
-    _write(args, result_to_dict(result))
+    result = _described(args, result, session.lost)
+    _write(args, result)
     lines = [*_report(args, result), *lines]
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
@@ -319,6 +281,53 @@ def run(args: argparse.Namespace) -> int:
         lines += _budget(result) if args.budget else []
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
+
+
+def _collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSession:
+    """Return the readings of the bag; what was rejected or lost is told."""
+    with progress_bar("reading") as bar:
+        session = collect_bag(
+            args.bag,
+            settings,
+            namespace=args.namespace,
+            progress=lambda count: bar(count, None),
+        )
+    warnings = [*session.findings, *session.lost]
+    if not session.findings:
+        measurements = session.measurements
+        used = sum(view.used for view in measurements.views)
+        warnings += rejections(measurements.all_rejected(), used)
+    # a clock step is a finding, and noted in the result
+    for line in dict.fromkeys(warnings):
+        tell(f"selfcal {args.verb}: {args.bag}: {line}", sys.stderr)
+    return session
+
+
+def _require_other_recording(
+    bag: str, plate: CalibrationResult, plate_from: str
+) -> None:
+    """Refuse to recheck a plate by the recording that made it known."""
+    if plate.input.get("sha256") == bag_input(bag)["sha256"]:
+        raise InputError(
+            bag,
+            f"the recording that {plate_from} was computed from: it would be "
+            "compared with itself",
+            "record a new view of the plate",
+        )
+
+
+def _first_fault(
+    bag: str, error: NotIdentifiableError, session: BagSession
+) -> SelfcalError:
+    """Return what to correct before the plan, if the readings are deficient for another cause."""
+    # a fault of the cell: a plate placed otherwise, a wrong sign
+    if set(session.findings) - set(session.lost):
+        return InputError(bag, "correct this first", f"as it is, {error}")
+    if session.findings:  # missing readings look like a deficient plan
+        return NotIdentifiableError(
+            f"{bag}: correct this first; as it is, {error}", error.observability
+        )
+    return error
 
 
 def _with_map(args: argparse.Namespace, measurements: Measurements) -> Measurements:
@@ -346,12 +355,19 @@ def _calibrated(
         ) from error
 
 
-def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
+def _described(
+    args: argparse.Namespace, result: CalibrationResult, lost: list[str]
+) -> CalibrationResult:
+    """Return a result with its sentences, the recording it was solved from, and the time."""
+    return created_now(with_input(worded(result), bag_input(args.bag), lost))
+
+
+def _write(args: argparse.Namespace, result: CalibrationResult) -> None:
     """Write a result to a file, to stdout, or both."""
     if file_of(args):
-        write_json(args.output, data)
+        write_json(args.output, result_to_dict(result))
     if on_stdout(args):
-        put(data)
+        put(result_to_dict(result))
 
 
 def _validated(
