@@ -5,6 +5,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any, cast, get_args
@@ -36,6 +37,30 @@ SAME_FIGURE = 1e-6
 """Largest relative difference of a figure of a map and the same figure stated with it."""
 
 
+@dataclass
+class _SinceStatus:
+    """What happened since the last status.
+
+    Attributes
+    ----------
+    ages_s : list of float
+        Ages of corrected samples when they were published.
+    skipped, commands_refused, outside : int
+        Numbers of samples, of commands, and of positions outside the field.
+    strange_joints : tuple of str
+        Joints of the last sample without one of the stage.
+    other_frame : str
+        Frame of the last command that names another than the stage's.
+    """
+
+    ages_s: list[float] = field(default_factory=list)
+    skipped: int = 0
+    commands_refused: int = 0
+    outside: int = 0
+    strange_joints: tuple[str, ...] = ()
+    other_frame: str = ""
+
+
 class CompensatingSession:
     """Correct samples by the newest usable map; count samples that cannot be corrected.
 
@@ -65,13 +90,7 @@ class CompensatingSession:
         }
         self._waiting: list[tuple[bytes, int]] = []
         self._editor = PositionEditor()
-        self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
-        self._skipped = self._commands_refused = self._outside = 0  # since then
-        self._strange: tuple[
-            str, ...
-        ] = ()  # joints of the last sample without one of the stage
-        # of the last command that names another than the stage's
-        self._other_frame = ""
+        self._since_status = _SinceStatus()
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = self._contradicted = ""
@@ -288,7 +307,7 @@ class CompensatingSession:
         self._waiting = []
         samples = waiting if lost + len(waiting) <= KEEPS_UP else waiting[-1:]
         skipped = lost + len(waiting) - len(samples)
-        self._skipped += skipped
+        self._since_status.skipped += skipped
         self.counts["skipped"] += skipped
         for data, received_ns in samples:
             sample = self._editor.read(data)
@@ -298,7 +317,8 @@ class CompensatingSession:
             corrected = self.correct(*sample)
             if corrected is not None:
                 publish(self._editor.replaced(data, corrected))
-                self._ages_s.append((self._ports.wall_ns() - received_ns) * S_PER_NS)
+                age_s = (self._ports.wall_ns() - received_ns) * S_PER_NS
+                self._since_status.ages_s.append(age_s)
 
     def correct(
         self, names: Sequence[str], positions: Sequence[float]
@@ -337,10 +357,10 @@ class CompensatingSession:
             corrected = self._corrected(*sample, (use.command, use.command_theta))
         if corrected is None:
             self.counts["commands_refused"] += 1
-            self._commands_refused += 1
+            self._since_status.commands_refused += 1
             return None
         if self._editor.frame_id not in ("", self._settings.frame_id):
-            self._other_frame = self._editor.frame_id
+            self._since_status.other_frame = self._editor.frame_id
         self.counts["commands"] += 1
         return self._editor.replaced(data, corrected)
 
@@ -366,15 +386,10 @@ class CompensatingSession:
         place = {name: index for index, name in enumerate(names)}
         if not len(positions) == len(names) == len(place):
             return None
-        joints = (
-            self._settings.joint_x,
-            self._settings.joint_y,
-            self._settings.joint_theta,
-        )
-        x, y, theta = map(place.get, joints)
+        x, y, theta = map(place.get, self._joints)
         stage = [index for index in (x, y, theta) if index is not None]
         if not stage:
-            self._strange = tuple(names)
+            self._since_status.strange_joints = tuple(names)
         if not stage or (x is None) != (y is None):
             return None
         # nor NaN
@@ -390,7 +405,7 @@ class CompensatingSession:
                 )
                 if not self.compensator.is_inside(positions[x], positions[y]):
                     self.counts["outside"] += 1
-                    self._outside += 1
+                    self._since_status.outside += 1
             if theta is not None and self.compensator.has_theta:
                 corrected[theta] = float(corrections[1](positions[theta]))
         except InputError:
@@ -475,71 +490,62 @@ class CompensatingSession:
         """Return the diagnosis of the node, and of its timing since the last call."""
         return merged(self._state(), [self._pace()])
 
+    @property
+    def _joints(self) -> tuple[str, str, str]:
+        """Names of the stage's joints."""
+        settings = self._settings
+        return settings.joint_x, settings.joint_y, settings.joint_theta
+
     def _pace(self) -> Diagnosis:
-        ages_s = self._ages_s
-        self._ages_s = []
-        skipped = self._skipped
-        self._skipped = 0
-        oldest = max(ages_s, default=0.0)
-        limit = self._settings.max_age
+        seen = self._since_status
+        self._since_status = _SinceStatus()
         lines = []
-        if skipped:
+        if seen.skipped:
             lines.append(
-                f"{skipped} samples skipped since the last status: newer ones arrived "
+                f"{seen.skipped} samples skipped since the last status: newer ones arrived "
                 "before they could be corrected, or they were lost in transport"
             )
-        refused = self._commands_refused
-        self._commands_refused = 0
-        if refused:
+        if seen.commands_refused:
             lines.append(
-                f"{refused} commands refused since the last status and not passed on: no "
-                "map, no complete position, a joint named twice, or a position where the "
-                "map is unknown"
+                f"{seen.commands_refused} commands refused since the last status and not "
+                "passed on: no map, no complete position, a joint named twice, or a position "
+                "where the map is unknown"
             )
-        strange = self._strange
-        self._strange = ()
         # beside samples of the stage they may be others
-        if strange and (refused or not ages_s):
-            stage_joints = ", ".join(
-                (
-                    self._settings.joint_x,
-                    self._settings.joint_y,
-                    self._settings.joint_theta,
-                )
-            )
+        if seen.strange_joints and (seen.commands_refused or not seen.ages_s):
             lines.append(
-                f"joints {printable(', '.join(strange))} are not of the stage ({stage_joints}): "
-                "correct joint_x, joint_y and joint_theta, or the publisher"
+                f"joints {printable(', '.join(seen.strange_joints))} are not of the stage "
+                f"({', '.join(self._joints)}): correct joint_x, joint_y and joint_theta, or "
+                "the publisher"
             )
-        frame = self._other_frame
-        self._other_frame = ""
-        if frame:
+        if seen.other_frame:
             lines.append(
-                f"commands name the frame {printable(frame)!r}, but are corrected as "
-                f"positions in {self._settings.frame_id!r}: transform them first, or set "
+                f"commands name the frame {printable(seen.other_frame)!r}, but are corrected "
+                f"as positions in {self._settings.frame_id!r}: transform them first, or set "
                 "frame_id if it is the stage's"
             )
-        outside = self._outside
-        self._outside = 0
-        if outside:
+        if seen.outside:
             lines.append(
-                f"{outside} positions outside the field since the last status, corrected "
+                f"{seen.outside} positions outside the field since the last status, corrected "
                 "as at its edge: how well is not known"
             )
-        if oldest > limit:
+        if not seen.ages_s:
+            return Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
+        oldest_s = max(seen.ages_s)
+        limit_s = self._settings.max_age
+        if oldest_s > limit_s:
             lines.append(
-                f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
-                f"published, max_age is {limit * MS_PER_S:g} ms"
+                f"a corrected position was {oldest_s * MS_PER_S:.1f} ms old when it was "
+                f"published, max_age is {limit_s * MS_PER_S:g} ms"
             )
-        values = (
+        return Diagnosis(
+            Level.WARN if lines else Level.OK,
+            "; ".join(lines),
             {
-                "age_ms": f"{median(ages_s) * MS_PER_S:.2f}",
-                "age_ms_max": f"{oldest * MS_PER_S:.2f}",
-            }
-            if ages_s
-            else {}
+                "age_ms": f"{median(seen.ages_s) * MS_PER_S:.2f}",
+                "age_ms_max": f"{oldest_s * MS_PER_S:.2f}",
+            },
         )
-        return Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines), values)
 
     def _state(self) -> Diagnosis:
         waits = f"; not used: {self._waits}" if self._waits else ""
