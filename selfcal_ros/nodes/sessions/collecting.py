@@ -322,43 +322,60 @@ class CollectingSession:
             final=final,
         )
         for index, view in progress.items():
-            stamp = from_model.session_stamp_ns(timeline, view)
-            current = index == timeline.intervals[-1].view_index or not view.complete
-            key = view_digest(view.readings.parts, measurements.rejected)
-            ready = index in ended or view.complete
-            # empty, unless a previous collector may have sent its readings
-            worth = (
-                view.readings.used
-                or view.readings.rejected
-                or index in self._published
-                or (index in ended and (timeline.plan_id, index) not in self.missed)
-            )
-            is_new = self._published.get(index) != key or self._noted != self._stepped
-            if ready and worth and is_new:
-                self._published[index], self._noted = key, self._stepped
-                for part in view.readings.parts:
-                    self._ports.publish(
-                        "measurement",
-                        from_model.view_measurement(
-                            replace(view, readings=part),
-                            measurements,
-                            stamp,
-                            frame_id,
-                            self._stepped,
-                        ),
-                    )
+            stamp_ns = from_model.session_stamp_ns(timeline, view)
+            if self._is_due(index, view, measurements, has_ended=index in ended):
+                self._publish_readings(view, measurements, stamp_ns)
             # after the readings: a complete view can be solved
+            current = index == timeline.intervals[-1].view_index or not view.complete
             if current or index == max(progress) or final:
                 fields = from_model.view_status(
                     view,
                     timeline.plan_id,
-                    stamp,
+                    stamp_ns,
                     frame_id,
                     run_id=timeline.run_id,
                     name_all=stuck or index in ended,
                 )
                 fields["complete"] &= not self._clock.ahead  # may be of another view
                 self._ports.publish("status", fields)
+
+    def _is_due(
+        self,
+        index: int,
+        view: ViewProgress,
+        measurements: Measurements,
+        *,
+        has_ended: bool,
+    ) -> bool:
+        """Return whether the readings of a view are to be published, which is then noted.
+
+        That is: once the view has ended or is complete, and after every change.
+        """
+        timeline = self.collector.timeline
+        # empty, unless a previous collector may have sent its readings
+        is_worth = (
+            view.readings.used
+            or view.readings.rejected
+            or index in self._published
+            or (has_ended and (timeline.plan_id, index) not in self.missed)
+        )
+        key = view_digest(view.readings.parts, measurements.rejected)
+        is_new = self._published.get(index) != key or self._noted != self._stepped
+        if not (is_worth and is_new and (has_ended or view.complete)):
+            return False
+        self._published[index], self._noted = key, self._stepped
+        return True
+
+    def _publish_readings(
+        self, view: ViewProgress, measurements: Measurements, stamp_ns: int
+    ) -> None:
+        """Publish the readings of a view, of each cell of its images by itself."""
+        for part in view.readings.parts:
+            of_part = replace(view, readings=part)
+            fields = from_model.view_measurement(
+                of_part, measurements, stamp_ns, self.settings.frame_id, self._stepped
+            )
+            self._ports.publish("measurement", fields)
 
     def _tell_steps(self) -> None:
         """Log once that a clock has stepped or is ahead; in the health until the run ends."""
