@@ -9,6 +9,7 @@ from typing import Any
 
 from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.errors import SelfcalError
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again, Duty
@@ -94,9 +95,8 @@ class Driver:
             is_placed = self._placing and command.phase == Phase.MEASURE
             if not is_placed:
                 self._jobs.clear()
-            if self._busy and not is_placed:
-                self._visitor.stop()
-            if job is not None:
+            stands = is_placed or not self._busy or self._stop()
+            if job is not None and stands:
                 self._jobs.append(job)
             self._placing = command.phase == Phase.PLACE
             self._turn.notify()
@@ -134,14 +134,32 @@ class Driver:
         except Exception as error:
             if self._visitor.stopped:
                 return  # a new command
-            line = (
-                str(error)
-                if isinstance(error, SelfcalError)
-                else (f"machine: {type(error).__name__}: {error}")
+            self._report(error)
+
+    def _report(self, error: Exception) -> None:
+        line = (
+            str(error)
+            if isinstance(error, SelfcalError)
+            else (f"machine: {type(error).__name__}: {error}")
+        )
+        if line != self.problem:
+            self._say(line)
+        self.problem = line
+
+    def _stop(self) -> bool:
+        """Stop what is being visited; return whether it could be, and say if it could not."""
+        try:
+            self._visitor.stop()
+        except SelfcalError as error:
+            self._report(
+                MachineError(
+                    f"it cannot be stopped ({error})",
+                    "machine.stop",
+                    "use the emergency stop",
+                )
             )
-            if line != self.problem:
-                self._say(line)
-            self.problem = line
+            return False
+        return True
 
     def _look(self) -> None:
         self.events.append(self._visitor.sample())
@@ -178,7 +196,10 @@ class Driver:
         with self._turn:
             self._jobs.clear()
             self._ending = True
-            self._visitor.stop()
+            self._stop()
             self._turn.notify()
         self._thread.join(self._cell.settle.patience)
-        self._machine.close()
+        try:
+            called("machine.close", self._machine.close)
+        except SelfcalError as error:
+            self._report(error)

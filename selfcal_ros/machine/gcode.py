@@ -7,6 +7,7 @@ G53 where the dialect has it. Modes of units,
 distances and feeds that a program left are set anew.
 """
 
+import contextlib
 import math
 import re
 import time
@@ -26,7 +27,8 @@ PATIENCE_S = 5.0
 """The same for its acceleration, and for answers."""
 POLL_S = 0.02
 GREETING_S = 2.0
-"""Longest silence in the greeting of a board that was reset by opening its port."""
+"""Longest silence in the greeting of a board that was reset by opening its port, and
+between the answers to what was given up: Marlin says every 2 s that it is busy."""
 SAME_ZERO_MM = 0.02
 """Difference of a position that Marlin tells, to two decimals, from its steps without an offset."""
 HOLD_S = 0.3
@@ -132,7 +134,8 @@ class GcodeMachine:
         try:
             self._talk.move(_Travel(f"{words} F{self._feed:g}", longest_s))
         except MachineError:
-            self.stop()
+            with contextlib.suppress(MachineError):  # the caller stops as well
+                self.stop()
             raise
 
     def image(self) -> Image | None:
@@ -144,16 +147,20 @@ class GcodeMachine:
         return []
 
     def stop(self) -> None:
-        """Stop at once, as far as the connection still carries it."""
-        try:
-            self._talk.stop()
-        except MachineError:  # said by whatever failed before
-            return
+        """Stop at once.
+
+        Raises
+        ------
+        MachineError
+            If the connection does not carry it.
+        """
+        self._talk.stop()
 
     def close(self) -> None:
         """Release port and camera."""
         if self._camera:
             self._camera.close()
+        self._talk.close()
         self._lines.close()
 
 
@@ -175,12 +182,26 @@ class _Talk:
         self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]
     ) -> None:
         self._lines, self._axes, self._passwords = lines, axes, passwords
+        self._stale = False  # answers of what was given up may still come
         self._may_greet = True  # it is being reset, or may have been before
         self._begin()
         self._may_greet = False
 
     def _begin(self) -> None:
         """Bring the controller to mm and absolute coordinates."""
+
+    def close(self) -> None:
+        """Release what is not the connection of the machine."""
+
+    def _until_quiet(self) -> None:
+        """Read away what comes by itself: a greeting, answers of what was given up."""
+        deadline = time.monotonic() + 3 * PATIENCE_S  # M155 reports for good
+        try:
+            while time.monotonic() < deadline:
+                self._lines.receive(GREETING_S)
+        except MachineError as error:
+            if "no answer" not in error.what:
+                raise
 
     def _receive(self, timeout_s: float | None = None) -> str:
         """Return the next line.
@@ -209,6 +230,9 @@ class _Talk:
 
     def _ok(self, line: str, timeout_s: float = PATIENCE_S) -> list[str]:
         """Send a line, return what comes before its ``ok``."""
+        if self._stale:
+            self._stale = False
+            self._until_quiet()
         self._lines.send(line)
         before: list[str] = []
         deadline = time.monotonic() + timeout_s
@@ -257,15 +281,6 @@ class _Grbl(_Talk):
                 "it reports positions in inches ($13=1)", "controller", "set $13=0"
             )
         self._ok("G21 G90 G94")
-
-    def _until_quiet(self) -> None:
-        """Read the greeting away; a controller that was open before says nothing."""
-        try:
-            while True:
-                self._lines.receive(GREETING_S)
-        except MachineError as error:
-            if "no answer" not in error.what:
-                raise
 
     def _status(self) -> tuple[str, list[float]]:
         """Return the state, and the machine's position, mm."""
@@ -392,9 +407,8 @@ class _Marlin(_Talk):
         self._ok("M400", travel.longest_s)
 
     def stop(self) -> None:
+        self._stale = True  # its ok, and that of a move it ends, come when they come
         self._lines.send_raw(self.HALT)
-        time.sleep(HOLD_S)
-        self._lines.forget()  # its ok
 
 
 class _Klipper(_Marlin):
@@ -405,44 +419,66 @@ class _Klipper(_Marlin):
 
 
 class _LinuxCnc(_Talk):
-    """linuxcncrsh: ``get abs_act_pos`` tells the actual machine position, ``set mdi`` moves."""
+    """linuxcncrsh: ``get abs_act_pos`` tells the actual machine position, ``set mdi`` moves.
+
+    It reads the next line of a connection when the move of the last one has ended: a stop needs
+    a connection of its own. One connection at a time is enabled, the one that asked last.
+    """
 
     ORDER = "XYZABCUVW"
 
     def _begin(self) -> None:
-        password, enable = self._passwords
-        self._lines.send(f"hello {password} selfcal 1.0")
-        answer = self._lines.receive()
+        self._greet(self._lines)
+        self._take_over()
+        self._for_stop = self._lines.again()
+        try:
+            self._greet(self._for_stop)
+        except BaseException:
+            self.close()
+            raise
+
+    def _greet(self, lines: Lines) -> None:
+        password, _ = self._passwords
+        lines.send(f"hello {password} selfcal 1.0")
+        answer = lines.receive()
         if answer.startswith("hello"):  # its echo
-            answer = self._lines.receive()
+            answer = lines.receive()
         if not answer.upper().startswith("HELLO ACK"):
             raise MachineError(
                 f"linuxcncrsh answered '{answer}'", "controller", "check password"
             )
-        self._lines.send("set echo off")
+        lines.send("set echo off")
+        self._set("verbose on", lines)
+
+    def _take_over(self) -> None:
+        """Be the connection that is enabled, in mm and absolute coordinates."""
+        self._is_enabled = True
         for words in (
-            "verbose on",
-            f"enable {enable}",
+            f"enable {self._passwords[1]}",
             "mode mdi",
             "set_wait done",
             "mdi G21 G90 G94",
         ):
-            self._set(words)
+            self._set(words, self._lines)
 
-    def _set(self, words: str, timeout_s: float = PATIENCE_S) -> None:
-        """Send a set command, and wait for its acknowledgement; its echo is passed over."""
-        self._lines.send(f"set {words}")
+    def _set(self, words: str, lines: Lines, timeout_s: float = PATIENCE_S) -> None:
+        """Send a set command; raise MachineError unless it is acknowledged."""
+        answer = self._answer(words, lines, timeout_s)
+        if not answer.endswith("ACK"):
+            raise MachineError(
+                f"'set {words}' was answered by '{answer}'",
+                "controller",
+                "release the emergency stop, switch the machine on, home it",
+            )
+
+    def _answer(self, words: str, lines: Lines, timeout_s: float = PATIENCE_S) -> str:
+        """Send a set command, return its answer; its echo is passed over."""
+        lines.send(f"set {words}")
         deadline = time.monotonic() + timeout_s
         while True:
-            answer = self._lines.receive(max(deadline - time.monotonic(), 0.01)).upper()
-            if answer.endswith("ACK"):
-                return
-            if answer.endswith("NAK") or answer.startswith("ERROR"):
-                raise MachineError(
-                    f"'set {words}' was answered by '{answer}'",
-                    "controller",
-                    "release the emergency stop, switch the machine on, home it",
-                )
+            answer = lines.receive(max(deadline - time.monotonic(), 0.01)).upper()
+            if answer.endswith(("ACK", "NAK")) or answer.startswith("ERROR"):
+                return answer
 
     def position(self) -> list[float]:
         self._lines.send("get abs_act_pos")
@@ -458,10 +494,17 @@ class _LinuxCnc(_Talk):
         return [values[place] for place in places]
 
     def move(self, travel: _Travel) -> None:
-        self._set(f"mdi G53 G1 {travel.words}", travel.longest_s)
+        if not self._is_enabled:
+            self._take_over()
+        self._set(f"mdi G53 G1 {travel.words}", self._lines, travel.longest_s)
 
     def stop(self) -> None:
-        self._lines.send("set abort")
+        self._is_enabled = False
+        self._set(f"enable {self._passwords[1]}", self._for_stop)
+        self._answer("abort", self._for_stop)  # NAK: it is switched off, and stands
+
+    def close(self) -> None:
+        self._for_stop.close()
 
 
 NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")

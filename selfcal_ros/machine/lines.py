@@ -31,7 +31,7 @@ class Lines:
     def __init__(self, port: str, baud: int, timeout_s: float) -> None:
         import serial  # extra gcode
 
-        self._port, self._timeout_s = port, timeout_s
+        self._port, self._baud, self._timeout_s = port, baud, timeout_s
         self._lost = (serial.SerialException, OSError)
         try:
             self._serial: Any = serial.serial_for_url(port, baudrate=baud, timeout=0.1)
@@ -41,6 +41,10 @@ class Lines:
                 port,
                 "check name, cable and permissions (group dialout)",
             ) from error
+
+    def again(self) -> "Lines":
+        """Return another connection to the same controller; raises like the first."""
+        return Lines(self._port, self._baud, self._timeout_s)
 
     def send(self, line: str) -> None:
         """Send a line."""

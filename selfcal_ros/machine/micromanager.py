@@ -158,7 +158,8 @@ class MicroManagerMachine:
         try:
             self._call("the move", self._core.waitForDevice, self._stage)
         except MachineError:
-            self.stop()
+            with contextlib.suppress(MachineError):  # the caller stops as well
+                self.stop()
             raise
 
     def image(self) -> Image:
@@ -174,9 +175,8 @@ class MicroManagerMachine:
         return []
 
     def stop(self) -> None:
-        """Stop the stage."""
-        with contextlib.suppress(Exception):  # said by whatever failed before
-            self._core.stop(self._stage)
+        """Stop the stage; raises MachineError if the core cannot."""
+        self._call("the stop", self._core.stop, self._stage)
 
     def close(self) -> None:
         """Unload all devices: a process that ends without dies of a signal."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The machine ``ophyd``: motors and detectors of ophyd, as laboratories drive them (EPICS, ...)."""
 
+import contextlib
 import importlib
 import math
 from functools import partial, reduce
@@ -113,7 +114,8 @@ class OphydMachine:
             for axis, status in waiting:
                 _called(axis, status.wait, timeout=self._timeout_s)
         except MachineError:
-            self.stop()
+            with contextlib.suppress(MachineError):  # the caller stops as well
+                self.stop()
             raise
 
     def image(self) -> Image | None:
@@ -133,10 +135,16 @@ class OphydMachine:
         return []
 
     def stop(self) -> None:
-        """Stop all axes."""
+        """Stop all axes; raises MachineError of the first that cannot be."""
+        failed: list[MachineError] = []
         for axis, motor in self._motors.items():
             if hasattr(motor, "stop"):
-                _called(axis, motor.stop)
+                try:
+                    _called(axis, motor.stop)
+                except MachineError as error:
+                    failed.append(error)
+        if failed:
+            raise failed[0]
 
     def close(self) -> None:
         """Do nothing: the objects belong to their module."""

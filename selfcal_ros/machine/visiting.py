@@ -40,6 +40,9 @@ TRIES = 3
 """Exposures that are tried at a stop whose position changes meanwhile."""
 ANSWER_S = 60.0
 """Longest wait for an answer of the machine, beside `settle: patience`: for its slowest move."""
+STOPS, STOP_AGAIN_S = 3, 0.1
+"""A move that was being prepared when the machine was stopped begins after that: it is stopped
+again while it lasts, so many times."""
 EMPTY_STOPS = 5
 """Stops one after another at which nothing is seen, after which a view is given up."""
 FIRST_TURN_RAD = 0.01
@@ -188,7 +191,12 @@ class Visitor:
     def stop(self) -> None:
         """Stop the machine, and whatever is being visited; may be called from another thread."""
         self.stopped = True
-        called("machine.stop", self.machine.stop)
+        for _ in range(STOPS):
+            called("machine.stop", self.machine.stop)
+            self.clock.sleep(STOP_AGAIN_S)
+            asked = self._asked
+            if asked is None or asked[0] != "machine.move_to":
+                return
 
     def _ask(self, name: str, *values: Any) -> Any:
         """Call a method of the machine; its errors, and no answer, become MachineError.

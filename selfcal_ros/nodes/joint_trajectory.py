@@ -192,11 +192,20 @@ class JointTrajectoryMachine:
         return []
 
     def stop(self) -> None:
-        """Send the joints to where they are."""
+        """Send the joints to where they are.
+
+        Raises
+        ------
+        MachineError
+            If no controller listens, or the newest position is none.
+        """
         with self._news:
             position = self._states[1]
-        if position and self._trajectory.get_subscription_count():
-            self._send(position, LEAST_S)
+        if not all(map(math.isfinite, position)):
+            raise MachineError(
+                f"the position is {position}", self._states_topic, "check the encoders"
+            )
+        self._send(position, LEAST_S)
 
     def close(self) -> None:
         """Leave the graph."""

@@ -127,6 +127,61 @@ def test_a_machine_that_is_stopped_while_it_is_asked_is_not_silent_later(cell):
     wait_until(lambda: not driver.trouble, "another answer")
 
 
+def test_a_move_that_was_being_prepared_at_an_abort_is_stopped_once_it_begins(cell):
+    """A controller is asked for its position before it is sent away."""
+    driver, _, machine, command = cell
+    move_to, preparing, moving = machine.move_to, threading.Event(), threading.Event()
+    stopped, stops = threading.Event(), []
+
+    def moves(position):
+        preparing.set()
+        wait_until(lambda: stops, "the abort")
+        moving.set()
+        assert stopped.wait(5.0)
+        move_to(position)
+
+    def stop():
+        stops.append(moving.is_set())
+        if stops[-1]:
+            stopped.set()
+        else:
+            moving.wait(1.0)
+
+    command(Phase.PLACE)
+    machine.move_to, machine.stop = moves, stop
+    threading.Thread(target=command, args=[Phase.MEASURE]).start()
+    preparing.wait()
+    driver.take_command(replace(driver._duty.command, phase=Phase.ABORT, stamp_ns=1))
+    assert stops[0] is False
+    assert stops[1] is True
+
+
+def test_a_machine_that_cannot_be_stopped_is_said_and_takes_no_other_view(cell):
+    driver, said, machine, command = cell
+    move_to, moving, ended = machine.move_to, threading.Event(), threading.Event()
+
+    def moves(position):
+        moving.set()
+        ended.wait()
+        move_to(position)
+
+    def lost():
+        raise OSError("no route to host")
+
+    command(Phase.PLACE)
+    machine.move_to, machine.stop = moves, lost
+    threading.Thread(target=command, args=[Phase.MEASURE]).start()
+    moving.wait()
+    again = replace(driver._duty.command, stamp_ns=START_NS + 1000)
+    driver.take_command(again)
+    assert "machine.stop: it cannot be stopped" in said[-1]
+    assert "no route to host" in said[-1] and said[-1].endswith("emergency stop")
+    ended.set()
+    wait_until(lambda: not driver.busy, "the end of the move")
+    assert driver.trouble == said[-1]
+    assert not any(isinstance(event, Detection) for event in driver.events)
+
+
 def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
     """The positions on the way to it begin where the stage has stood meanwhile."""
     driver, _, _, command = cell

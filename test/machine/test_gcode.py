@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controllers that take G-code: each dialect measures a plan; faults are named and stop it."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from test.support.firmware import (
     over_pty,
     over_tcp,
 )
+from test.support.waiting import wait_until
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.usefixtures("quick_controllers")
@@ -75,6 +78,63 @@ def test_positions_are_mm_of_the_controller(dialect):
         machine.stop()
         machine.position()
         assert firmware.stopped
+        machine.close()
+
+
+def test_a_linuxcnc_stops_in_the_middle_of_a_move_and_moves_again_when_asked():
+    """It does not read the connection that waits for the end of the move."""
+    firmware = LinuxCnc()
+    firmware.move_s = 3.0
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "linuxcnc", feed=6000.0)
+        mover = threading.Thread(target=machine.move_to, args=[(0.01, 0.0)])
+        mover.start()
+        wait_until(lambda: firmware.at["X"] == 10.0, "the move")
+        machine.stop()
+        assert firmware.stopped
+        mover.join(1.0)
+        assert not mover.is_alive()
+        firmware.move_s = 0.0
+        assert machine.position() == pytest.approx((0.005, 0.0))
+        machine.move_to((0.001, 0.0))
+        assert machine.position() == pytest.approx((0.001, 0.0))
+        machine.close()
+
+
+def test_a_linuxcnc_in_emergency_stop_refuses_to_abort_and_stands():
+    firmware = LinuxCnc()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "linuxcnc", feed=6000.0)
+        firmware.alarm = "emergency stop"
+        machine.stop()
+        machine.close()
+
+
+@pytest.mark.parametrize("dialect", KINDS)
+def test_a_stop_that_the_connection_does_not_carry_is_an_error(dialect, monkeypatch):
+    """Else nobody is told to use the emergency stop."""
+    with over_tcp(KINDS[dialect]()) as port:
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+
+        def lost(*_):
+            raise OSError("no route to host")
+
+        for lines in (machine._lines, getattr(machine._talk, "_for_stop", None)):
+            if lines:
+                monkeypatch.setattr(lines._serial, "write", lost)
+        with pytest.raises(MachineError, match="the connection was lost"):
+            machine.stop()
+        machine.close()
+
+
+def test_answers_that_come_after_a_stop_are_not_taken_for_those_of_the_next_command():
+    """Marlin acknowledges M410, and the move that it ends, when it has come to rest."""
+    firmware = Marlin()
+    firmware.halt_s = 0.05
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "marlin", feed=6000.0)
+        machine.stop()
+        assert machine.position() == (0.0, 0.0)
         machine.close()
 
 

@@ -31,6 +31,18 @@ def devices(monkeypatch):
     return module
 
 
+def test_an_axis_that_cannot_be_stopped_does_not_keep_the_other_moving(devices):
+    def lost():
+        raise OSError("not connected")
+
+    stops = []
+    devices.x.stop, devices.y.stop = lost, lambda: stops.append("y")
+    machine = OphydMachine("beamline:x", "beamline:y")
+    with pytest.raises(MachineError, match="x: OSError: not connected"):
+        machine.stop()
+    assert stops == ["y"]
+
+
 def test_a_plan_is_measured_to_its_true_map(tmp_path, devices):
     from ophyd import Component, Device
     from ophyd.sim import SynSignal

@@ -20,6 +20,7 @@ from selfcal_ros.nodes.joint_trajectory import JointTrajectoryMachine
 from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import PLAN, Agreeing, write_cell
+from test.support.waiting import wait_until
 
 
 class Controller(Node):
@@ -55,7 +56,7 @@ class Controller(Node):
 
     def _show(self) -> None:
         stamp_ns = time.time_ns()
-        self._simulated.move_to((*self.at, 0.0))
+        self._simulated.move_to((*np.nan_to_num(self.at), 0.0))
         self._images.publish(
             fill(
                 Image(),
@@ -127,6 +128,33 @@ def test_a_plan_is_measured_by_a_controller_to_its_true_map(controller, tmp_path
         machine.close()
     away, _ = away_from(simulated.truth, tmp_path / "bag")
     assert np.abs(away).max() < 5e-8
+
+
+def test_a_position_that_is_no_number_is_not_commanded_at_a_stop(controller):
+    node, _, _ = controller
+    machine = JointTrajectoryMachine(**KEYS, timeout=20.0)
+    node.at = np.array([np.nan, 0.0])
+    try:
+        while np.isfinite(machine.position()).all():
+            pass
+        with pytest.raises(MachineError, match=r"the position is .*nan"):
+            machine.stop()
+        assert not node.goals
+    finally:
+        machine.close()
+
+
+def test_a_stop_that_no_controller_hears_is_an_error(controller):
+    node, _, _ = controller
+    machine = JointTrajectoryMachine(**KEYS, timeout=2.0)
+    for subscription in list(node.subscriptions):
+        node.destroy_subscription(subscription)
+    wait_until(lambda: not machine._trajectory.get_subscription_count(), "its end")
+    try:
+        with pytest.raises(MachineError, match="no controller listens"):
+            machine.stop()
+    finally:
+        machine.close()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pty
 import re
 import socket
 import threading
+import time
 import tty
 
 WORD = re.compile(r"([XYAF])(-?\d+\.?\d*)")
@@ -25,6 +26,10 @@ class Firmware:
         self.lines, self.stopped, self.dead, self.alarm = [], 0, False, ""
         self.zero = 0.0  # of the x of moves, mm: G92, M206
         self._moving = 0
+
+    def session(self):
+        """Return what answers a connection."""
+        return self
 
     def answer(self, line: str) -> bytes:
         raise AssertionError(line)
@@ -114,6 +119,8 @@ class FaultyGrbl(Grbl):
 class Marlin(Firmware):
     greeting = b"start\nMarlin 2.1.2\n"
     PER_MM = 80.0
+    halt_s = 0.0
+    """Time to come to rest."""
 
     def answer(self, line):
         if self.alarm:
@@ -130,6 +137,7 @@ class Marlin(Firmware):
             ).encode()
         if line == "M410":
             self.stopped += 1
+            time.sleep(self.halt_s)
         elif line.startswith("G1"):
             self.move(line)
         elif line == "M400":
@@ -151,13 +159,48 @@ class Klipper(Firmware):
 
 
 class LinuxCnc(Firmware):
-    """linuxcncrsh: sets are answered once verbose is on; every command is echoed until echo off."""
+    """linuxcncrsh: sets are answered once verbose is on; every command is echoed until echo off.
+
+    A connection is not read while its move lasts (`move_s`), one of them is enabled.
+    """
+
+    move_s = 0.0
 
     def __init__(self) -> None:
         super().__init__()
-        self._echo, self._verbose, self._enabled = True, False, False
+        self.enabled = None  # the connection
+        self.aborted = threading.Event()
+
+    def session(self):
+        return _Rsh(self)
+
+    def carry_out(self, line: str) -> None:
+        """Move; an abort ends the move half way."""
+        before = dict(self.at)
+        self.move(line)
+        self.aborted.clear()
+        if self.aborted.wait(self.move_s):
+            self.at = {axis: (before[axis] + to) / 2 for axis, to in self.at.items()}
+
+
+class _Rsh(Firmware):
+    """A connection to LinuxCNC."""
+
+    def __init__(self, machine: LinuxCnc) -> None:
+        super().__init__()
+        self._machine, self.lines = machine, machine.lines
+        self._echo, self._verbose = True, False
+
+    @property
+    def dead(self):
+        return self._machine.dead
+
+    @dead.setter
+    def dead(self, _):
+        pass
 
     def answer(self, line):
+        machine = self._machine
         echo = f"{line}\r\n".encode() if self._echo else b""
         word, *rest = line.split()
         if word == "hello":
@@ -168,8 +211,8 @@ class LinuxCnc(Firmware):
             return (
                 echo
                 + (
-                    f"ABS_ACT_POS {self.at['X']:.6f} {self.at['Y']:.6f} 0.000000 "
-                    f"{self.at['A']:.6f} 0.000000 0.000000\r\n"
+                    f"ABS_ACT_POS {machine.at['X']:.6f} {machine.at['Y']:.6f} 0.000000 "
+                    f"{machine.at['A']:.6f} 0.000000 0.000000\r\n"
                 ).encode()
             )
         if rest[:2] == ["echo", "off"]:
@@ -177,15 +220,16 @@ class LinuxCnc(Firmware):
         elif rest[:2] == ["verbose", "on"]:
             self._verbose = True
         elif rest[0] == "enable":
-            self._enabled = rest[1] == "EMCTOO"
-            if not self._enabled:
+            if rest[1] != "EMCTOO":
                 return echo + b"SET ENABLE NAK\r\n"
-        elif rest[0] == "abort":
-            self.stopped += 1
-        elif self.alarm or not self._enabled:
+            machine.enabled = self
+        elif machine.alarm or machine.enabled is not self:
             return echo + f"SET {rest[0].upper()} NAK\r\n".encode()
+        elif rest[0] == "abort":
+            machine.stopped += 1
+            machine.aborted.set()
         elif "G1" in rest:
-            self.move(line)
+            machine.carry_out(line)
         return echo + (
             f"SET {rest[0].upper()} ACK\r\n".encode() if self._verbose else b""
         )
@@ -195,26 +239,36 @@ class LinuxCnc(Firmware):
 def over_tcp(firmware):
     """Yield the address of a firmware behind a socket."""
     server = socket.create_server(("127.0.0.1", 0))
-    connections = []
+    connections, threads = [], []
+
+    def talk(connection) -> None:
+        _talk(firmware.session(), lambda: connection.recv(4096), connection.sendall)
+        connection.close()
 
     def serve() -> None:
         with contextlib.suppress(OSError):
-            connection, _ = server.accept()
-            connections.append(connection)
-            _talk(firmware, lambda: connection.recv(4096), connection.sendall)
-            connection.close()
+            while True:
+                connection, _ = server.accept()
+                connections.append(connection)
+                threads.append(
+                    threading.Thread(target=talk, args=[connection], daemon=True)
+                )
+                threads[-1].start()
 
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
+    threads.append(threading.Thread(target=serve, daemon=True))
+    threads[-1].start()
     try:
         yield f"socket://127.0.0.1:{server.getsockname()[1]}"
     finally:
+        with contextlib.suppress(OSError):
+            server.shutdown(socket.SHUT_RDWR)  # wakes accept
         server.close()
         for connection in connections:
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
-        thread.join(5)
+        for thread in threads:
+            thread.join(5)
 
 
 @contextlib.contextmanager
