@@ -150,7 +150,8 @@ class StepWatch:
 def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     """Return the step of the clock between two spans of messages; 0 if none.
 
-    The centres of the spans are compared, and the step must exceed the scatter of both.
+    The centres of the spans are compared, and the step must exceed the scatter of both. A
+    reception that stands still, as where a converter writes none, tells nothing.
     """
     (low, high), (next_low, next_high) = before, after
     scatter = np.maximum(high[0] - low[0], next_high[0] - next_low[0])
@@ -167,7 +168,8 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
         & (received < -limit_ns)
         & (np.minimum(-stamps, -received) > 2 * length)
     )
-    return np.where(ahead | back, by, np.where(together, stamps, 0))
+    moves = np.maximum(high[2], next_high[2]) > np.minimum(low[2], next_low[2])
+    return moves * np.where(ahead | back, by, np.where(together, stamps, 0))
 
 
 def step_lines(

@@ -30,6 +30,8 @@ from selfcal_ros.units import MM_PER_M
 
 MAX_VIEWS = 1000
 """Largest number of views of a plan."""
+MOST_REPEATS = 10_000
+"""Largest number of repeats of a mark in a view of a plan."""
 ROUNDED = 1e-3
 """Relative difference up to which a number is one of rad that was rounded, as 1.57."""
 MOST_CHARACTERS = 200
@@ -206,6 +208,12 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
     if raw["repeats"] < 1:
         raise InputError(
             f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more"
+        )
+    if raw["repeats"] > MOST_REPEATS:
+        raise InputError(
+            f"{where}: repeats",
+            f"{raw['repeats']} are more than {MOST_REPEATS}",
+            "give fewer",
         )
     if raw["angular"] and not artifact.angular_count:
         raise InputError(

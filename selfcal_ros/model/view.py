@@ -84,6 +84,8 @@ def parse_order(text: str, where: str = "visit_order") -> VisitOrder:
 MAX_SHIFT = 100_000
 """Largest translation of a view, in pitches."""
 
+MAX_TURN_RAD = 100.0
+"""Largest rotation of a view."""
 MOST_CHECK_OFFSET = 0.25
 """Largest distance of a check stop from its mark, in pitches."""
 
@@ -315,6 +317,12 @@ class View:
                 f"{where} rotation",
                 f"{self.rotation_rad} is not an angle",
                 "give a finite turn",
+            )
+        if abs(self.rotation_rad) > MAX_TURN_RAD:
+            raise InputError(
+                f"{where} rotation",
+                f"{math.degrees(self.rotation_rad):g} deg are many turns of a plate",
+                "give it within 360 deg",
             )
         a, b = (value / artifact.grid_pitch_m for value in self.translation_m)
         if max(abs(a), abs(b)) > MAX_SHIFT + 0.5:

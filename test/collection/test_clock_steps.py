@@ -57,6 +57,13 @@ def test_the_limit(by_ns, number):
     assert len(found(stepped(1500, by_ns), TRUE)) == number
 
 
+@pytest.mark.parametrize("received", [0, TRUE[0]])
+def test_a_reception_that_stands_still_tells_of_no_step(received):
+    """A pause between two views is none."""
+    stamps = stepped(1500, 4 * S)
+    assert found(stamps, np.full_like(stamps, received)) == []
+
+
 def test_two_steps_are_two():
     stamps = stepped(1000, S)
     stamps[2000:] -= 3 * S

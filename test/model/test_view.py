@@ -121,6 +121,11 @@ def test_marks_have_no_sites_between_quarter_turns():
             "view 'v' rotation: -inf is not an angle; give a finite turn",
         ),
         (
+            View("v", -1e300),
+            PLATE,
+            "view 'v' rotation: -5.72958e+301 deg are many turns of a plate; give it w",
+        ),
+        (
             View("v", math.radians(15)),
             PLATE,
             "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by 90 "
@@ -385,6 +390,10 @@ def test_a_plate_without_angular_count_has_no_lines():
         (
             plan_with({"repeats": 0}),
             "f: views[0]: repeats: 0 is not positive; give 1 or more",
+        ),
+        (
+            plan_with({"repeats": 10**18}),
+            f"f: views[0]: repeats: {10**18} are more than 10000; give fewer",
         ),
         (
             plan_with(visit_order="spiral"),
