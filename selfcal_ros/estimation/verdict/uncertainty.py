@@ -16,6 +16,7 @@ from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solve import factors_of, variance_of_terms
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.options import OWED
+from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.budget import (
     BudgetLine,
     OfAssumption,
@@ -540,10 +541,14 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     """Estimate the error of linear interpolation; none with the nodes' own interpolation.
 
     What a map with nodes of its own does not follow is its lack of fit, part of its uncertainty.
+    A spline needs all of its nodes: with an unknown one the map is used linearly.
     """
     emap = result.error_map
-    if result.plate.map_grid is not None:
-        return _interpolation("xy", 0.0, 0.0)
+    grid = result.plate.map_grid
+    if grid is not None:
+        is_linear = grid.interpolation is Interpolation.BILINEAR
+        if is_linear or emap.valid.all():
+            return _interpolation("xy", 0.0, 0.0)
     errors = [
         [
             error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
-from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.budget import OfNoise
 from selfcal_ros.model.error_map import first_order
 from selfcal_ros.model.readings import Measurements
@@ -227,6 +228,26 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one():
     assert part.effect_max == pytest.approx(middle)
     assert part.effect_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
     nodes = replace(result, placed_plate=replace(ARTIFACT, map_grid=MapGrid(9, 0.01)))
+    part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
+    assert part.effect_max == part.effect_rms == 0
+
+
+def test_a_spline_with_an_unknown_node_has_the_error_of_the_linear_map_that_is_used():
+    result = calibrated(angular=False)
+    grid = MapGrid(9, 0.01)
+    nodes = replace(result, placed_plate=replace(result.plate, map_grid=grid))
+    x = ARTIFACT.x_m
+    gx = 1e-3 * x**2
+    gx[0, 0] = np.nan  # a corner that no view reaches
+    nothing = np.where(np.isfinite(gx), 0.0, np.nan)
+    curved = replace(result.error_map, gx=gx, gy=nothing, u_gx=nothing, u_gy=nothing)
+    part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
+    used = Compensator(curved, fitted="bicubic")
+    middle_of_a_cell = used.uncertainty(0.005, 0.0)[0]
+    assert part.effect_max == pytest.approx(1e-3 * 0.01**2 / 4)
+    assert middle_of_a_cell == pytest.approx(part.effect_max)
+    linear = replace(grid, interpolation=Interpolation.BILINEAR)
+    nodes = replace(result, placed_plate=replace(result.plate, map_grid=linear))
     part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
     assert part.effect_max == part.effect_rms == 0
 
