@@ -12,9 +12,10 @@ import numpy as np
 from scipy.special import chdtrc, digamma, polygamma
 
 from selfcal_ros.apply import StageMap
+from selfcal_ros.collection.marks.stops import stage_aside
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import covariance_of
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 
 DRAWS = 2000
 """Draws behind the uncertainties: 1.6 % standard error."""
@@ -136,7 +137,10 @@ def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Sca
 def _groups(
     view: ViewReadings, measurements: Measurements, axis: int, sign: int
 ) -> Iterator[tuple[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
-    """Yield the site of each mark with stage errors and signs of approach of its visits."""
+    """Yield the site of each mark with stage errors and signs of approach of its visits.
+
+    Not of check stops: what they add to the scatter is the scale and turn of the microscope.
+    """
     visits = view.visits
     if visits is None or not len(visits.mark):
         return
@@ -146,12 +150,24 @@ def _groups(
     x, y = pose.site_of(*artifact.places(view.m, view.n))
     values = sign * (visits.dx, visits.dy)[axis]
     approach = (visits.approach_x, visits.approach_y)[axis]
-    order = np.argsort(visits.mark, kind="stable")
+    ordinary = np.flatnonzero(~_at_check_stops(visits, view.view.check_offset_m))
+    order = ordinary[np.argsort(visits.mark[ordinary], kind="stable")]
     starts = np.flatnonzero(np.diff(visits.mark[order], prepend=-1))
     for rows in np.split(order, starts[1:]):
         mark = visits.mark[rows[0]]
         site = int(sign * x[mark] - off[0]), int(sign * y[mark] - off[1])
         yield site, (values[rows], approach[rows])
+
+
+def _at_check_stops(visits: GridVisits, check_offset_m: float) -> np.ndarray:
+    """Return which visits are check stops, bool (V,)."""
+    place_m = np.stack([visits.dx - visits.offset_x, visits.dy - visits.offset_y])
+    aside = (
+        stage_aside(visits.mark, place_m, check_offset_m) if check_offset_m else None
+    )
+    if aside is None:
+        return np.zeros(len(visits.mark), dtype=bool)
+    return aside.any(axis=0)
 
 
 def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:

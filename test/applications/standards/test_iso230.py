@@ -164,6 +164,29 @@ def test_the_scatter_of_approaches_is_that_of_the_machine():
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=4 / np.sqrt(2 * len(off)))
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_check_stops_are_no_approaches(axis):
+    """What a microscope of a wrong scale shows of them is no scatter of the stage."""
+    rng = np.random.default_rng(1)
+    plan = hu_plan(ARTIFACT, 4)
+    checked = tuple(
+        replace(view, check_marks=5 * view.grid, check_offset_m=20e-6 * view.grid)
+        for view in plan.views
+    )
+    truth = random_truth(ARTIFACT, len(plan.views), rng, Spread(microscope_scale=5e-3))
+    readings = simulate_measurements(
+        truth,
+        replace(plan, views=checked),
+        rng,
+        settings=CellSettings(servo_sigma_m=0.0, visit_order="x_back_y_back"),
+    )
+    found = scatters(readings, axis)
+    assert max(len(view.visits.mark) / len(view.m) for view in readings.views) > 4
+    for item in found.values():
+        assert item.s_up_m < 1e-9 and item.s_down_m < 1e-9
+        assert abs(item.reversal_m) < 1e-9
+
+
 def test_the_reversal_of_unequal_approaches_is_that_of_one_least_squares():
     """Per site: one reversal and a mean a view, from visits of which every third is missing."""
     _, readings = measured(sigma=30e-9)
