@@ -429,11 +429,30 @@ def _identified_at(
     )
     assignment = replace(assignment, deviation=assignment.deviation + away)
     assignment.reasons[number < 0] = Reason.OUTSIDE_IMAGE
+    if view.image is None:
+        assignment.reasons[_beside_a_nearer(d, assignment)] = Reason.SEVERAL
     astray = assignment.reasons == Reason.NOT_AT_MARK
     if astray.any():
         astray &= np.isin(d["stamp"], d["stamp"][assignment.reasons == None])  # noqa: E711
         assignment.reasons[astray] = Reason.SEVERAL
     return assignment, number
+
+
+def _beside_a_nearer(d: np.ndarray, assignment: identify.MarkAssignment) -> np.ndarray:
+    """Return the accepted detections whose exposure shows a mark nearer to the stage, int (k,).
+
+    Marks of a list lie closer together than the stage may stand beside the site of one.
+    """
+    accepted = np.flatnonzero(assignment.reasons == None)  # noqa: E711
+    if (np.diff(d["stamp"][accepted]) > 0).all():
+        return accepted[:0]
+    away = assignment.deviation[:, accepted] - np.stack([d["ox"], d["oy"]])[:, accepted]
+    order = accepted[np.lexsort((np.hypot(*away), d["stamp"][accepted]))]
+    _, first, exposure = np.unique(
+        d["stamp"][order], return_index=True, return_inverse=True
+    )
+    nearest = assignment.index[:, order[first[exposure]]]
+    return order[(assignment.index[:, order] != nearest).any(axis=0)]
 
 
 def _reduce_grid(

@@ -99,14 +99,19 @@ def test_marks_at_whose_sites_the_stage_does_not_stand_do_not_move_the_others():
     assert table(found.views[0]).items() <= whole.items()
 
 
+@pytest.mark.parametrize("limit_m", [0.0, 2 * PITCH])
 @pytest.mark.parametrize("with_ids", [True, False])
 @pytest.mark.parametrize("sense", Sense)
 def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(
-    with_ids, sense
+    with_ids, sense, limit_m
 ):
-    """At each stop the microscope sees the whole plate; the other marks are named as that."""
+    """At each stop the microscope sees the whole plate; the other marks are named as that.
+
+    Also those beside which the stage might stand, as on a list of marks close together.
+    """
     cell = scene(count=0, sense=sense)
-    plain, _ = collect(cell.events, measurement_sense=str(sense))
+    limits = {"measurement_sense": str(sense), "max_stage_distance": limit_m}
+    plain, _ = collect(cell.events, **limits)
     seen = []
     for at in cell.detections:
         for other in cell.detections:
@@ -121,7 +126,7 @@ def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(
                 )
             )
     events = [*cell.commands, *cell.samples, *seen]
-    collector = gathered(events, measurement_sense=str(sense))
+    collector = gathered(events, **limits)
     found, progress = collector.collect()
     assert found.all_rejected() == {"other_mark_of_one_exposure": 600}
     assert table(found.views[0]) == table(plain.views[0])
