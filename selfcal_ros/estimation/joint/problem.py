@@ -149,6 +149,7 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the noise to use: declared, else repeats, else residuals.
 
+    Repeats have `MIN_REPEAT_DOF` degrees of freedom, or as many as the residuals have.
     If a test contradicts this choice, or both are too small to be tested, the larger one is used.
     Repeats that are identical, but for rounding, show the resolution of the sensor, not the noise,
     and are ignored.
@@ -173,10 +174,8 @@ def noise_estimate(
         else ((float("nan"), 0.0) if identical else repeats)
     )
     p = _same_noise(base, residuals, floor)
-    if np.isfinite(declared) or base[1] >= MIN_REPEAT_DOF or not residuals[1]:
-        chosen = base
-    else:
-        chosen = residuals
+    few = base[1] < min(MIN_REPEAT_DOF, residuals[1])
+    chosen = residuals if few else base
     estimate = NoiseEstimate(
         sigma=chosen[0],
         dof=chosen[1],

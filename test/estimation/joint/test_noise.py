@@ -64,6 +64,15 @@ def test_repeats_count_from_thirty_degrees_of_freedom(dof, used):
     assert not found.contradicted
 
 
+@pytest.mark.parametrize(("dof", "used"), [(8, "repeats"), (10, "residuals")])
+def test_few_repeats_count_where_residuals_have_fewer_degrees_of_freedom(dof, used):
+    """Of three lines in three views residuals have one or two: by chance a third of the noise."""
+    found = noise_estimate((1e-8, 9), (0.5e-8, dof), NAN)
+    assert not found.contradicted
+    assert found.sigma == {"repeats": 1e-8, "residuals": 0.5e-8}[used]
+    assert found.dof == {"repeats": 9, "residuals": dof}[used]
+
+
 @pytest.mark.parametrize(
     ("ratio", "contradicted"),
     [(1.09, False), (1.11, True), (1 / 1.09, False), (1 / 1.11, True)],
