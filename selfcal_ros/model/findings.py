@@ -273,6 +273,10 @@ class RoughnessUntested(Finding):
     """Whether the nodes of the map suffice was not tested."""
 
 
+class HarmonicsUntested(Finding):
+    """Whether the harmonics of the angular map suffice was not tested."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TermWithoutReadings(Finding):
     """A term on which no reading depends."""

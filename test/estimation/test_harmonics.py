@@ -29,6 +29,7 @@ from selfcal_ros.estimation.verdict.roughness import _fitted_lines
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.findings import HarmonicsUntested
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Grade
@@ -347,6 +348,26 @@ def test_an_encoder_rougher_than_its_harmonics_is_named_and_covered():
         calibrate(measured(plan(24, 6), seed, lines=5.0)[1], BARE) for seed in range(12)
     ]
     assert not [cause for one in enough for cause in one.verdict.causes]
+
+
+@pytest.mark.parametrize(
+    ("count", "harmonics", "turns_deg", "said"),
+    [
+        (7, 3, (37,), True),
+        (24, 8, (37,), True),
+        (24, 4, (37,), False),
+        (7, 3, (37, 101), False),
+        (24, 11, (37, 101), False),
+    ],
+)
+def test_a_series_that_two_views_cannot_contradict_says_so(
+    count, harmonics, turns_deg, said
+):
+    _, readings = measured(plan(count, harmonics, turns_deg))
+    result = calibrate(readings, BARE)
+    assert (HarmonicsUntested() in result.findings) is said
+    text = "whether the harmonics of the angular map suffice for the rotary encoder"
+    assert (text in json.dumps(result_to_dict(worded(result)))) is said
 
 
 def test_a_result_keeps_its_harmonics_and_is_compared_with_its_covariance():

@@ -38,6 +38,7 @@ from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
+from selfcal_ros.estimation.verdict.roughness import harmonics_untested
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
@@ -54,6 +55,7 @@ from selfcal_ros.model.findings import (
     Cause,
     Finding,
     FiniteRotation,
+    HarmonicsUntested,
     LinesSignNotShown,
     NoiseContradicted,
     NoiseUnknown,
@@ -146,6 +148,9 @@ def judged(
         enlargements(result, searched.terms, shown_effects),
     )
     untested = solved.model is not None and is_untested(solved.model.problem)
+    lines_untested = solved.model is not None and harmonics_untested(
+        solved.model.problem.system.angular
+    )
     result = replace(
         result,
         verdict=verdict,
@@ -154,6 +159,7 @@ def judged(
             *_visits_findings(checked),
             *views_findings(measurements),
             *[RoughnessUntested()] * untested,
+            *[HarmonicsUntested()] * lines_untested,
             *_without_readings(solved, options),
         ),
         provenance=provenance_of(measurements, options),

@@ -22,6 +22,7 @@ from selfcal_ros.model.findings import (
     Finding,
     FiniteRotation,
     Found,
+    HarmonicsUntested,
     LinesSignNotShown,
     Magnification,
     NoiseContradicted,
@@ -285,6 +286,11 @@ FIXED: dict[type, str] = {
         "whether the nodes of the map suffice for the stage was not tested, and U has no "
         "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
         "readings too few, for a finer map; solve with fewer nodes once, or add a view"
+    ),
+    HarmonicsUntested: (
+        "whether the harmonics of the angular map suffice for the rotary encoder was not tested, "
+        "and U has no contribution for it: the readings are too few for more of them; read the "
+        "lines in a further view at another turn"
     ),
     VisitedOnce: (
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
