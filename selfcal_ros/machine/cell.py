@@ -36,6 +36,10 @@ FOLDER = "folder"
 """Key of a machine that gets the folder of CELL.yaml unless the file gives it."""
 DEFAULT_STEP_M = 1e-4
 """First move where the size of the marks is not known."""
+FIRST_TURN_RAD = 0.01
+"""First move of a rotary axis."""
+LONGEST_WAIT_S = 3600.0
+"""Longest wait for rest."""
 LONGEST_M = 20.0
 """Limits beyond are in another unit."""
 PLACERS = ("person", "robot")
@@ -185,7 +189,15 @@ def read_cell(path: str | Path) -> Cell:
         "sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense))
     )
     placing, place_command = _placing(data.get("placing", "person"), where)
-    return Cell(
+    settle = Settle(
+        **_numbers(
+            data.get("settle", {}),
+            f"{where}: settle",
+            {item.name: getattr(Settle(), item.name) for item in fields(Settle)},
+            low=0.0,
+        )
+    )
+    cell = Cell(
         path,
         machine,
         _mapping(data.get(machine_key, {}), f"{where}: {machine_key}"),
@@ -194,18 +206,40 @@ def read_cell(path: str | Path) -> Cell:
             data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)
         ),
         sense=Sense(sense.check(data.get("sense", sense.default), where)),
-        settle=Settle(
-            **_numbers(
-                data.get("settle", {}),
-                f"{where}: settle",
-                {item.name: getattr(Settle(), item.name) for item in fields(Settle)},
-                low=0.0,
-            )
-        ),
+        settle=settle,
         detector=_detector(data["detector"], where) if "detector" in data else None,
         placing=placing,
         place_command=place_command,
     )
+    _check_settle(cell, f"{where}: settle")
+    return cell
+
+
+def _check_settle(cell: Cell, where: str) -> None:
+    """Raise InputError for tolerances that hide whether the stage moves, or endless waits."""
+    least_move_m = max(cell.first_step_m, DEFAULT_STEP_M)
+    for name in ("within", "arrival"):
+        length_m, angle = cell.settle.of("x", name), cell.settle.of("theta", name)
+        if length_m >= least_move_m:
+            raise InputError(
+                f"{where}: {name}",
+                f"{length_m:g} m would hide a stage that stands still: is it in um?",
+                f"give m, below {least_move_m:g}",
+            )
+        if angle >= FIRST_TURN_RAD:
+            raise InputError(
+                f"{where}: {name}_theta",
+                f"{angle:g} rad would hide an axis that stands still: is it in degrees?",
+                f"give rad, below {FIRST_TURN_RAD:g}",
+            )
+    for name in ("time", "patience"):
+        wait_s = getattr(cell.settle, name)
+        if wait_s > LONGEST_WAIT_S:
+            raise InputError(
+                f"{where}: {name}",
+                f"{wait_s:g} s are more than {LONGEST_WAIT_S:g} s",
+                "give s",
+            )
 
 
 def _machine(name: Any, where: str) -> str:

@@ -17,7 +17,7 @@ from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
 from selfcal_ros.errors import NoDataError, first_line
 from selfcal_ros.machine.calling import called
-from selfcal_ros.machine.cell import Cell
+from selfcal_ros.machine.cell import FIRST_TURN_RAD, Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Image, Machine, MachineError, Offset
@@ -45,8 +45,6 @@ STOPS, STOP_AGAIN_S = 3, 0.1
 again while it lasts, so many times."""
 EMPTY_STOPS = 5
 """Stops one after another at which nothing is seen, after which a view is given up."""
-FIRST_TURN_RAD = 0.01
-"""First move of a rotary axis."""
 FOLLOWS = 0.25
 """Largest deviation, over the step, of a position or a mark from the step of the stage."""
 UNITS = {

@@ -74,6 +74,18 @@ def test_a_cell_with_all_its_keys(tmp_path):
             "settle: time: -3.0 is below 0.0; correct the value",
         ),
         (
+            f"{LIMITS}machine: simulated\nsettle: {{arrival: 20}}\n",
+            "settle: arrival: 20 m would hide a stage that stands still: is it in um",
+        ),
+        (
+            f"{LIMITS}machine: simulated\nsettle: {{within_theta: 0.5}}\n",
+            "within_theta: 0.5 rad would hide an axis that stands still: is it in deg",
+        ),
+        (
+            f"{LIMITS}machine: simulated\nsettle: {{patience: .inf}}\n",
+            "settle: patience: inf s are more than 3600 s",
+        ),
+        (
             f"{LIMITS}machine: simulated\norigin: {{x: low}}\n",
             "'low' is not of type float",
         ),
