@@ -160,6 +160,10 @@ def text_of(output: str, counts: dict[str, int]) -> str:
             ("images_without_marks", "images without marks"),
             ("images_refused", "images refused"),
             (
+                "images_repeated",
+                "images that are the one before them under another stamp: no repeats",
+            ),
+            (
                 "images_with_more_pages",
                 "images with further pages, which were not used",
             ),

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.bagio.messages.to_model import stamp_ns
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError, NoDataError, printable
@@ -24,6 +26,8 @@ from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 SETTLED = 3
 """Consecutive images that fix the camera and the size for all."""
 
+MANY_REPEATED = 5
+"""Images like the one before them from which a camera is said to give each twice."""
 MOST_STAMPS = 100_000
 """Most stamps that are kept to refuse repeated images: an hour of 30 a second."""
 
@@ -42,6 +46,8 @@ class Counts:
         Images that were used, and those of them without any mark.
     refused : int
         Images that could not be used.
+    repeated : int
+        Images that are the one before them, pixel by pixel, under another stamp.
     paged : int
         Images whose file has further pages, which were not used.
     marks : int
@@ -53,9 +59,15 @@ class Counts:
     images: int = 0
     empty: int = 0
     refused: int = 0
+    repeated: int = 0
     paged: int = 0
     marks: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def come_twice(self) -> bool:
+        """Whether images come again under other stamps: the noise of a camera repeats in none."""
+        return self.repeated >= MANY_REPEATED and 2 * self.repeated >= self.images - 1
 
     def values(self) -> dict[str, int]:
         """Return name -> number, the reasons last."""
@@ -64,6 +76,7 @@ class Counts:
             "images_refused": self.refused,
             "images_without_marks": self.empty,
             "marks": self.marks,
+            **({"images_repeated": self.repeated} if self.repeated else {}),
             **({"images_with_more_pages": self.paged} if self.paged else {}),
             **{
                 f"rejected_{name}": count
@@ -107,6 +120,7 @@ class ImageDetector:
         self._empty: Picture | None = None
         self._source = _Source()
         self._stamps: dict[int, None] = {}  # of the images used, in their order
+        self._last: np.ndarray | None = None  # grey values of the image before
 
     def take(self, message: Any) -> list[Detection]:
         """Return the detections of an image message, row by row.
@@ -188,6 +202,10 @@ class ImageDetector:
         self._stamps[stamp] = None
         if len(self._stamps) > MOST_STAMPS:
             del self._stamps[next(iter(self._stamps))]
+        self.counts.repeated += self._last is not None and np.array_equal(
+            self._last, picture.values
+        )
+        self._last = picture.values
         self.counts.paged += picture.more_pages
         self.counts.images += 1
         self.counts.empty += not detections

@@ -69,6 +69,14 @@ class DetectingSession:
             return Diagnosis(
                 Level.WARN, f"no mark in the last {self._empty} images{why}", values
             )
+        if counts.come_twice:
+            return Diagnosis(
+                Level.ERROR,
+                f"{counts.repeated} of {counted(counts.images, 'image')} are the one before them, "
+                "pixel by pixel, under another stamp: publish each exposure once, or let the "
+                "camera expose for each",
+                values,
+            )
         return Diagnosis(
             Level.OK,
             f"{counted(counts.marks, 'mark')} in {counted(counts.images, 'image')}",

@@ -176,3 +176,24 @@ def test_more_possible_marks_than_max_marks_refuse_the_image(desk):
         ):
             session.take(image(1, values))
         assert session.diagnosis().values["images_refused"] == 1
+
+
+def test_images_that_come_again_under_other_stamps_are_an_error(desk):
+    """A driver publishes each twice, or the camera did not expose: these repeats are none."""
+    rng = np.random.default_rng(2)
+    noisy = [CAMERA.image(np.zeros((2, 1)), rng) for _ in range(12)]
+    for stamp, values in enumerate(noisy):
+        desk.session.take(image(2 * stamp, values))
+    found = desk.session.diagnosis()
+    assert (found.level, "images_repeated" in found.values) == (Level.OK, False)
+    for stamp, values in enumerate(noisy):
+        desk.session.take(image(100 + 2 * stamp, values))
+        desk.session.take(image(101 + 2 * stamp, values))
+    assert desk.session.diagnosis().values["images_repeated"] == 12
+    for stamp, values in enumerate(noisy):
+        desk.session.take(image(200 + 2 * stamp, values))
+        desk.session.take(image(201 + 2 * stamp, values))
+        desk.session.take(image(300 + stamp, values))
+    found = desk.session.diagnosis()
+    assert found.level == Level.ERROR
+    assert found.message.startswith("36 of 72 images are the one before them, pixel by")
