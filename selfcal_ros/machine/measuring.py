@@ -244,10 +244,16 @@ class Run:
         self._run_id, self._stamp_ns = last.run_id, last.stamp_ns
         self._resumed = True
         self._sequencer.resume(last.view_index, last.phase)
-        name = self.plan.views[last.view_index].name
-        if last.phase == Phase.MEASURE and self.desk.lies_still(name):
+        if last.phase == Phase.MEASURE and self._may_go_on():
             return []
         return self._sequencer.redo()
+
+    def _may_go_on(self) -> bool:
+        """Return whether the view has readings to go on from, and the plate still lies for it."""
+        readings = self._progress().readings
+        if not (len(readings.m) or len(readings.k)):
+            return False  # nothing shows how the plate lies: it is placed again
+        return self.desk.lies_still(self.plan.views[self._sequencer.index].name)
 
     def _place(self) -> None:
         """Have the plate placed; the stage does not move meanwhile."""

@@ -10,6 +10,7 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.machine import MachineError
+from selfcal_ros.machine.cell import open_machine
 from selfcal_ros.machine.measuring import Run, collector_settings
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.settings.nodes import CollectorSettings
@@ -172,6 +173,31 @@ def test_marks_that_were_missed_are_visited_again(tmp_path):
         ).measurements.views
     ]
     assert min(counts) >= 2
+
+
+def test_a_view_interrupted_before_its_first_reading_is_placed_again(tmp_path):
+    """The robot of a new process has no plate yet, and no reading would show it."""
+    cell, machine = write_cell(tmp_path)
+
+    class Lost(Spoilt):
+        placed = ()
+
+        def place(self, placing):
+            self.placed += (placing.view,)
+            super().place(placing)
+
+        def move_to(self, position):
+            if self.placed == ("identity", "rot90"):
+                raise MachineError("the power failed")
+            super().move_to(position)
+
+    with pytest.raises(MachineError, match="the power failed"):
+        run_of(tmp_path, Lost(machine), cell).measure()
+    again = Lost(open_machine(cell))
+    run_of(tmp_path, again, cell, Jumping(Jumping().ns + 10**12)).measure(resume=True)
+    assert again.placed == ("rot90", "shift")
+    away, _ = away_from(machine.truth, tmp_path / "bag")
+    assert np.abs(away).max() < 5e-8
 
 
 def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
