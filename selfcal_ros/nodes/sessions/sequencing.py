@@ -59,6 +59,7 @@ class SequencingSession:
         self.on_end: Callable[[], None] | None = None
         self._own: set[tuple] = set()
         self._fresh = True  # has neither sent nor followed a command
+        self._followed_runs = False  # and has not ended, by its last command
         self._deadline, self._confirm_at, self._redos = math.inf, math.inf, 0
         self._commanded_ns = 0
         self._measured: dict[tuple[str, str], dict[int, str]] = {}
@@ -172,7 +173,13 @@ class SequencingSession:
             self.waiting = False
             self._end()
             return f"{self.machine.state}: no longer waiting"
-        return self.act(self.machine.abort)
+        goes_on = self.machine.state is State.FOLLOWING and self._followed_runs
+        answer = self.act(self.machine.abort)
+        if goes_on:
+            answer += (
+                "; what it followed is another node's run, and goes on: abort it there"
+            )
+        return answer
 
     def take_measurement(self, message: Any) -> None:
         """Record a view of this plan that has been completed."""
@@ -227,6 +234,7 @@ class SequencingSession:
         elif self.machine.state is not State.FOLLOWING:  # its own plan ends here
             self._ports.say(Level.WARN, warning)
         self.machine.foreign_command()
+        self._followed_runs = command.phase in (Phase.PLACE, Phase.MEASURE)
         self.waiting = self._fresh = False
         self._end()
 

@@ -458,6 +458,20 @@ def test_a_foreign_command_ends_waiting_and_its_own_plan(desk, measuring):
         measuring.session.begin()
 
 
+@pytest.mark.parametrize("phase", Phase)
+def test_an_abort_says_that_it_does_not_stop_the_run_of_another_sequencer(desk, phase):
+    foreign = Command(
+        START_NS, phase, "other", view=PLAN.views[0], artifact=PLAN.artifact
+    )
+    desk.session.take_command(
+        message("ViewCommand", from_model.command(foreign, "stage"))
+    )
+    answer = desk.session.give_up()
+    assert answer.startswith("idle: view 0")
+    assert ("goes on: abort it there" in answer) == (phase in (PLACE, MEASURE))
+    assert not desk.commands
+
+
 def test_its_own_command_is_not_foreign(measuring):
     measuring.session.take_command(
         message("ViewCommand", measuring.hands.of("command")[0])
