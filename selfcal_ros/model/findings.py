@@ -228,6 +228,14 @@ class ChangedOrMicroscope(Changed):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ChangedOrMarks(Changed):
+    """A change that `mark` shows by itself, `away` from its neighbours, and `others` likewise."""
+
+    away: float
+    others: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScaleChanged(Finding):
     """The scale of the encoders against the plate changed since `of`, a file; seen in `passes`."""
 

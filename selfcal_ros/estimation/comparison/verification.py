@@ -32,7 +32,7 @@ from selfcal_ros.estimation.comparison.maps import (
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.model.error_map import ErrorMap, datum_columns, rms
-from selfcal_ros.model.findings import OtherPlate
+from selfcal_ros.model.findings import ChangedOrMarks, OtherPlate
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verified import AxisError
@@ -262,15 +262,19 @@ def require_correctable(result: CalibrationResult, where: str) -> None:
 def is_believed(after: CalibrationResult, verification: "Verification") -> bool:
     """Return whether the readings with the correction on may be believed.
 
-    Against a known plate, a stage that is corrected wrongly looks like another plate.
+    Against a known plate, a stage that is corrected wrongly looks like another plate, or like one
+    of which marks have changed.
     """
     named = verification.fault not in (
         TableFault.NONE,
         TableFault.OTHER,
         TableFault.OLDER,
     )
-    other_plate = {type(finding) for finding in after.verdict.failed} == {OtherPlate}
-    return after.verdict.qualified or (named and other_plate)
+    of_plate = {type(finding) for finding in after.verdict.failed} <= {
+        OtherPlate,
+        ChangedOrMarks,
+    }
+    return after.verdict.qualified or (named and of_plate)
 
 
 def corrected(result: CalibrationResult) -> CalibrationResult:

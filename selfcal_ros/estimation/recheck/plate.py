@@ -283,6 +283,12 @@ LEAST = 0.01
 STEPS = 6
 """Steps to the motion of a view by least absolute values."""
 
+NEIGHBOURS = 8
+"""Marks around one that show where it should be."""
+
+AGREEING = 6
+"""How many of them agree as far as a stage that changes continuously lets them."""
+
 PLANNED = (1 + 0j, 0j)
 """No further turn, no further shift."""
 
@@ -385,6 +391,54 @@ def check_plate(
                 of=plate.where,
             )
     return None
+
+
+@dataclass(frozen=True)
+class LoneMark:
+    """A mark that is off by itself: the plate's (m, n), how far, m, and how far over its limit."""
+
+    mark: tuple[int, int]
+    away: float
+    over: float
+
+
+def lone_marks(
+    measurements: Measurements, plate: KnownPlate, sigma: float
+) -> list[LoneMark]:
+    """Return marks that are off by themselves, the clearest first: a stage changes continuously.
+
+    A mark is, if what the known plate leaves of it differs from the median of its neighbours, and
+    from the plane through them, by more than noise and the differences of most of them explain.
+    Parameters as for `check_plate`.
+    """
+    found = []
+    for view in measurements.views:
+        if view.view.cell not in (None, (0, 0)):
+            continue
+        read_marks = _read(view, measurements, plate, sigma)
+        if read_marks is None:
+            continue
+        left = read_marks.remaining_at(plate.field, measurements.artifact, PLANNED)
+        if left is None or len(left[0]) <= NEIGHBOURS:
+            continue
+        remaining, readable = left
+        places = read_marks.marks[readable]
+        beside = places[None] - places[:, None]
+        nearest = np.argsort(np.abs(beside), axis=1)[:, 1 : NEIGHBOURS + 1]
+        near = remaining[nearest]
+        middle = np.median(near.real, axis=1) + 1j * np.median(near.imag, axis=1)
+        step = np.take_along_axis(beside, nearest, axis=1)
+        design = np.stack([np.ones_like(step.real), step.real, step.imag], axis=-1)
+        plane = (np.linalg.pinv(design)[:, 0] * near).sum(axis=1)
+        away = np.minimum(np.abs(remaining - middle), np.abs(remaining - plane))
+        spread = np.sort(np.abs(near - middle[:, None]), axis=1)[:, AGREEING - 1]
+        over = away / (2 * BEYOND * np.hypot(spread, read_marks.u))
+        m, n = view.m[readable], view.n[readable]
+        found += [
+            LoneMark((int(m[i]), int(n[i])), float(away[i]), float(over[i]))
+            for i in np.flatnonzero(over > 1)
+        ]
+    return sorted(found, key=lambda lone: -lone.over)
 
 
 def _read(

@@ -48,7 +48,12 @@ from selfcal_ros.estimation.recheck.change import (
     map_change,
     recheck_found,
 )
-from selfcal_ros.estimation.recheck.plate import KnownPlate, check_plate, on_plate
+from selfcal_ros.estimation.recheck.plate import (
+    KnownPlate,
+    check_plate,
+    lone_marks,
+    on_plate,
+)
 from selfcal_ros.estimation.recheck.views import (
     NOISE,
     PLATE,
@@ -83,6 +88,7 @@ from selfcal_ros.model.error_map import (
 from selfcal_ros.model.findings import (
     Changed,
     ChangedOrDrifted,
+    ChangedOrMarks,
     ChangedOrMicroscope,
     Finding,
     MicroscopeOff,
@@ -333,9 +339,22 @@ def _failed(
         failed = _misfit(solved.solution.square, solved.readings.dof, dof_noise)
     if not changes:
         return failed
+    if not failed:
+        failed = _by_marks(solved, changes[0])
     if not failed and outcome.passes == 1 and not drift_declared:
         failed = (ChangedOrDrifted(**vars(changes[0])),)
     return failed + _by_microscope(solved, outcome, changes[0])
+
+
+def _by_marks(solved: Rechecked, changed: Changed) -> tuple[Finding, ...]:
+    """Return a finding if single marks show the change, each by itself."""
+    lone = lone_marks(solved.measurements, solved.plate, solved.xy.sigma)
+    if not lone:
+        return ()
+    first = lone[0]
+    others = len({one.mark for one in lone} - {first.mark})
+    data = vars(changed) | {"mark": first.mark, "away": first.away, "others": others}
+    return (ChangedOrMarks(**data),)
 
 
 def _changes(outcome: Recheck) -> tuple[Changed, ...]:

@@ -321,6 +321,7 @@ def sentence_of(finding: Finding | Cause) -> str:
 
 for _text_of in (
     phrases.changed_or_drifted_text,
+    phrases.changed_or_marks_text,
     phrases.changed_or_microscope_text,
     phrases.changed_text,
     phrases.few_read_text,

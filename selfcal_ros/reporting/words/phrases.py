@@ -21,6 +21,7 @@ from selfcal_ros.model.budget import (
 from selfcal_ros.model.findings import (
     Changed,
     ChangedOrDrifted,
+    ChangedOrMarks,
     ChangedOrMicroscope,
     FewRead,
     Finding,
@@ -318,6 +319,18 @@ def changed_or_microscope_text(finding: ChangedOrMicroscope) -> str:
         f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad (k=1) "
         "explains it alike: measure check stops (check_stops in the plan), or correct the "
         "pixel size"
+    )
+
+
+def changed_or_marks_text(finding: ChangedOrMarks) -> str:
+    """Return the reason why a change that single marks show is not qualified."""
+    more = f" and {counted(finding.others, 'other')} likewise" if finding.others else ""
+    return (
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
+        f"({p_text(finding.p)}), but mark {finding.mark} lies "
+        f"{finding.away * UM_PER_M:.3g} µm away from where its neighbours show it{more}: dirt or "
+        "damage explains that as well as a stage that has changed there alone; clean the plate "
+        "and measure again, or place it turned by 90°: what stays with the mark is of the plate"
     )
 
 
