@@ -46,15 +46,17 @@ def calibrated(truth, rng):
     return calibrate(readings, bare(causes=False))
 
 
-def machine(seed, wiring):
+def machine(seed, wiring, *, size=1.0):
     """Return the calibrations before and after of a machine with another plate each time.
 
     `wiring`: "right", or one of `WRONG`; with "exchanged" and "unit" the seed chooses which. Or
-    what the controller makes of the table (2, 7, 7).
+    what the controller makes of the table (2, 7, 7). `size`: of the error of x and y.
     """
     rng = np.random.default_rng(seed)
     first = replace(
-        random_truth(ARTIFACT, 4, rng), g=smooth_error(rng), g_theta=smooth_angle(rng)
+        random_truth(ARTIFACT, 4, rng),
+        g=size * smooth_error(rng),
+        g_theta=smooth_angle(rng),
     )
     before = calibrated(first, rng)
     table = np.stack([before.error_map.gx, before.error_map.gy])

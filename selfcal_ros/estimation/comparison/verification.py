@@ -326,7 +326,8 @@ def verify(
             "solve it again with --uncertainty always",
         )
     fault = _fault(maps, first)
-    if maps.better and not maps.remains:
+    shown = fault in (TableFault.FACTOR, TableFault.AXES_DIFFER)  # beyond 3 u of 1
+    if maps.better and not maps.remains and not shown:
         fault = TableFault.NONE
     elif fault is TableFault.OTHER and (
         maps.better or maps.alike * abs(maps.alike) > SHARED

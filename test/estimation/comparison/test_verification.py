@@ -41,6 +41,18 @@ def test_the_sentence_names_what_acts(wiring):
                 assert abs(axis.factor - factor) < 5 * axis.u_factor
 
 
+@pytest.mark.parametrize("seed", [3, 5, 13])
+def test_half_of_a_correction_is_named_though_what_remains_is_within_u(seed):
+    """Of a small error half is hidden by noise, place by place; the factor is not."""
+    before, after, _ = machine(seed, lambda table: 0.5 * table, size=0.1)
+    found = verify(before, after)
+    assert found.better and not found.remains and not found.passed
+    assert found.fault is TableFault.FACTOR
+    assert "look for a wrong unit" in verification_sentence(found)
+    before, after, _ = machine(seed, "right", size=0.1)
+    assert verify(before, after).passed
+
+
 @pytest.mark.parametrize(
     ("fault", "loaded"),
     [
