@@ -22,7 +22,7 @@ from selfcal_ros.model.terms import (
     parse_terms,
 )
 from selfcal_ros.model.view import DEFAULT_ORDER, Plan, parse_order
-from selfcal_ros.reporting.words.findings import MRAD, unit_of
+from selfcal_ros.reporting.words.quantities import MRAD, unit_of
 from selfcal_ros.reporting.words.tables import removal_text
 from selfcal_ros.units import M_PER, RAD_PER, UM_PER_M
 
@@ -63,7 +63,7 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
         "--sigma",
         metavar="LENGTH",
         help="noise of one reading, m or with a unit as in 20nm (default 20 nm); "
-        "if given, uncertainties are printed in um",
+        "if given, uncertainties are printed in µm",
     )
     parser.add_argument(
         "--stop-error",
@@ -110,9 +110,9 @@ def _quantity(
     text: str, option: str, units: Mapping[str, float], what: str, most: float
 ) -> float:
     """Return a positive number with one of the units, the first if none is given."""
-    match = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
+    match = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµμ]*)\s*", text)
     plain = next(iter(units))
-    unit = match[2].replace("µ", "u") or plain if match else ""
+    unit = re.sub("[µμ]", "u", match[2]) or plain if match else ""
     try:
         value = float(match[1]) * units[unit] if match else math.nan
     except (ValueError, KeyError):

@@ -44,8 +44,9 @@ from selfcal_ros.reporting.summary.numbers import (
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.findings import advice, unit_of, what_it_is
+from selfcal_ros.reporting.words.findings import advice, what_it_is
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
+from selfcal_ros.reporting.words.quantities import unit_of
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_MARKS = 51 * 51
@@ -200,9 +201,9 @@ def _cell(key: str, value: Any) -> str:
 
 
 ABOUT = {
-    "stage": "--stage NAME",
+    "stage": "--stage TEXT",
     "serial_number": "--serial-number TEXT",
-    "operator": "--operator NAME",
+    "operator": "--operator TEXT",
 }
 """Entries at the head of a report that the readings do not contain -> how to give them."""
 

@@ -37,8 +37,9 @@ from selfcal_ros.reporting.summary.numbers import (
     truth_figures,
     um,
 )
-from selfcal_ros.reporting.words.findings import assumption_text, unit_of
+from selfcal_ros.reporting.words.findings import assumption_text
 from selfcal_ros.reporting.words.phrases import counted_views, dof_text, of_few_read
+from selfcal_ros.reporting.words.quantities import unit_of
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import singledispatch
-from typing import Any, NamedTuple
+from typing import Any
 
 from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
@@ -60,41 +60,27 @@ from selfcal_ros.reporting.summary.numbers import counted, p_text
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
+from selfcal_ros.reporting.words.quantities import (
+    ARCSEC,
+    MRAD,
+    PERCENT,
+    RATIO,
+    UM,
+    URAD,
+    DisplayUnit,
+    size_text,
+    unit_of,
+)
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
     MM_PER_M,
     MRAD_PER_RAD,
-    PPM_PER_ONE,
     UM_PER_M,
     URAD_PER_RAD,
 )
 
 NAMED = 5
 """Sites and lines that are named one by one; the others are counted."""
-
-
-class DisplayUnit(NamedTuple):
-    """Display unit of a quantity: factor from SI, and name."""
-
-    per_si: float
-    name: str
-
-
-UM, RATIO = DisplayUnit(UM_PER_M, "µm"), DisplayUnit(PPM_PER_ONE, "µm/m")
-MRAD = DisplayUnit(MRAD_PER_RAD, "mrad")
-PERCENT = DisplayUnit(100.0, "%")
-ARCSEC, URAD = DisplayUnit(ARCSEC_PER_RAD, "arcsec"), DisplayUnit(URAD_PER_RAD, "µrad")
-
-
-def unit_of(name: str, si: str) -> DisplayUnit:
-    """Return the display unit of the estimates of a term, or of the size of a cause.
-
-    Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
-    """
-    block = blocks().get(name)
-    if si == "rad" and block is not None and (block.of_lines or block.of_images):
-        return URAD
-    return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, DisplayUnit(1.0, si))
 
 
 def plus_minus(finding: Found, unit: DisplayUnit, times: float = 1.0) -> str:
@@ -692,10 +678,9 @@ def assumption_text(result: CalibrationResult) -> str:
 
 def _assumed(line: BudgetLine) -> str:
     name = line.component.removeprefix(TERM)
-    unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, line.unit)
     of = line.details
     size_si = of.given if isinstance(of, OfTerm | OfAssumption) else line.u
-    size = f"{size_si * unit.per_si:.3g} {unit.name} (k=1)"
+    size = f"{size_text(line, size_si)} (k=1)"
     return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 
 

@@ -37,6 +37,7 @@ from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.reporting.summary.numbers import counted, p_text
+from selfcal_ros.reporting.words.quantities import size_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {
@@ -162,14 +163,16 @@ def line_text(line: BudgetLine) -> str:
                 else ""
             )
         case OfAssumption(given):
-            return f"size {given:.3g}, what the readings do not determine of it"
+            size = size_text(line, given)
+            return f"size {size}, what the readings do not determine of it"
         case OfTerm(given, allowed, remaining):
             but = (
                 "of which the readings"
                 if allowed is None
-                else f"too small for the readings; of {allowed:.3g}, which they allow, they"
+                else f"too small for the readings; of {size_text(line, allowed)}, which they "
+                "allow, they"
             )
-            return f"size {given:.3g}, {but} leave {100 * remaining:.0f} %"
+            return f"size {size_text(line, given)}, {but} leave {100 * remaining:.0f} %"
         case OfCause(cause) if cause == LACK_OF_FIT:
             return "residuals beyond the scatter of repeats, met in full at every place"
         case OfCause(cause):

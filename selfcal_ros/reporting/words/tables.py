@@ -111,18 +111,18 @@ def budget_text(budgets: list[Budget]) -> list[str]:
         )
         lines += [
             f"uncertainty of {quantity_text(budget)}, {unit}",
-            f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from",
+            f"  {'component':22}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from",
         ]
         for line in budget.lines:
             lines.append(
-                f"  {line.component:18}{line.kind:>5}{line.effect_rms * factor:12.4g}"
+                f"  {line.component:22}{line.kind:>5}{line.effect_rms * factor:12.4g}"
                 f"{line.effect_max * factor:12.4g}{dof_text(line.dof):>10}  "
                 f"{line.text or line_text(line)}"
             )
         lines += [
-            f"  {'combined':18}{'':5}{budget.u_rms * factor:12.4g}"
+            f"  {'combined':22}{'':5}{budget.u_rms * factor:12.4g}"
             f"{budget.u_max * factor:12.4g}{dof_text(budget.dof):>10}",
-            f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
+            f"  {f'expanded, k = {budget.k:.2f}':27}{budget.U_rms * factor:12.4g}"
             f"{budget.U_max * factor:12.4g}          95.45 % coverage",
         ]
     return lines

@@ -263,7 +263,7 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     line = next(
         c for c in budgets(result)[0].lines if c.component == "term plate_scale"
     )
-    assert line_text(line).startswith("size 1e-08, too small for the readings; of ")
+    assert line_text(line).startswith("size 0.01 µm/m, too small for the readings; of ")
     assert (line.source, line.details.allowed) == ("readings", term.size_used)
     right = calibrate(readings, options("plate_scale:5e-6"))
     assert right.model.terms[0].size_used is None

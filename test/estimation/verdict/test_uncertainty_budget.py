@@ -179,7 +179,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     noise = np.sqrt(np.mean(own**2)) * result.noise.sigma_xy
     assert parts["reading noise"].effect_rms == pytest.approx(noise, rel=1e-3)
     assert line.effect_rms > 0.2 * noise
-    assert line_text(line).startswith("size 1e-07, of which the readings leave ")
+    assert line_text(line).startswith("size 0.1 µm, of which the readings leave ")
     loose = parts_of(
         budgets(
             calibrate(readings, replace(plain, terms=(ModelTerm("plate_shape", 1e-9),)))

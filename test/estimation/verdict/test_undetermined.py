@@ -88,7 +88,7 @@ def test_a_drift_that_the_order_hides_is_assumed(sense):
         DRIFT.size,
         "default",
     )
-    assert line_text(line) == "size 1e-08, what the readings do not determine of it"
+    assert line_text(line) == "size 0.01 µm, what the readings do not determine of it"
     none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
     added = np.sqrt(u_of(result) ** 2 - u_of(none) ** 2)
     assert line.effect_rms == pytest.approx(rms(added))

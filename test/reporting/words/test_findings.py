@@ -52,13 +52,13 @@ from selfcal_ros.reporting.words.findings import (
     advice,
     remedies,
     sentence_of,
-    unit_of,
     what_it_is,
     worded,
     worded_verdict,
 )
 from selfcal_ros.reporting.words.observability import FIXED as FIXED_MODES
 from selfcal_ros.reporting.words.observability import mode_text
+from selfcal_ros.reporting.words.quantities import unit_of
 from test.support.maps import random_map, result_of
 from test.support.sources import PACKAGE
 
