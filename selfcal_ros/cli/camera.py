@@ -13,10 +13,14 @@ from selfcal_ros.cli.terminal import add_json, say, tell
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.reporting.summary.numbers import decimals_for, fixed
 from selfcal_ros.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.exposures import ImageDetector
+
+SIZE_OPTION = "--mark-pixels"
+"""Option that states the size of a mark in the image."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="size of the marks on the plate, m (as in selfcal detect)",
     )
     init.add_argument(
-        "--mark-pixels",
+        SIZE_OPTION,
         type=float,
         metavar="PX",
         required=True,
@@ -92,15 +96,15 @@ def run(args: argparse.Namespace) -> int:
             "polarity": args.polarity,
             "max_marks": ANY_NUMBER,
         },
-        "--mark-pixels",
+        SIZE_OPTION,
     )
-    detector = ImageDetector(settings, "--mark-pixels")
+    detector = ImageDetector(settings, SIZE_OPTION)
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
     counts = detector.counts
     if counts.empty:
         tell(
-            f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
-            "and are left out",
+            f"selfcal camera init: {args.bag}: {counts.empty} of {counts.images} images show no "
+            "mark and are left out",
             sys.stderr,
         )
     camera = camera_pose(positions, images, Sense(args.sense))
@@ -137,10 +141,12 @@ def run(args: argparse.Namespace) -> int:
 
 def pose_text(camera: "CameraPose", output: str) -> str:
     """Return a camera in one line."""
+    u_turn_deg = math.degrees(camera.u_turn_rad)
     return (
         f"{output}: pixel size {camera.pixel_size_m / M_PER_UM:.6g} µm (u "
-        f"{camera.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(camera.turn_rad):.5g}° "
-        f"(u {math.degrees(camera.u_turn_rad):.1g}°), "
+        f"{camera.u_pixel_size_m / M_PER_UM:.1g} µm), turn "
+        f"{fixed(math.degrees(camera.turn_rad), decimals_for([u_turn_deg], 1))}° "
+        f"(u {u_turn_deg:.1g}°), "
         f"{'mirrored' if camera.mirror else 'not mirrored'}; axes unequal or sheared by "
         f"{camera.sheared:.1g} (u {camera.u_sheared:.1g}); noise of a mark "
         f"{camera.noise_px:.2g} pixels"
@@ -163,12 +169,11 @@ def _of_bag(
                     np.array([(mark.offset_x, mark.offset_y) for mark in marks])
                 )
     for line, count in bag.lost.items():
-        tell(f"selfcal camera: {args.bag}: {count} x {line}", sys.stderr)
-    if not exposed or not len(stamps):
+        tell(f"selfcal camera init: {args.bag}: {count} x {line}", sys.stderr)
+    detector.refuse_nothing(args.bag, SIZE_OPTION)
+    if not len(stamps):
         raise NoDataError(
-            args.bag,
-            "no image with a mark, or no stage/joint_states",
-            "check mark, polarity and --mark-pixels",
+            args.bag, "no stage/joint_states", "record them with the images"
         )
     if min(exposed) < stamps[0] or max(exposed) > stamps[-1]:
         raise InputError(
@@ -193,4 +198,5 @@ def _of_files(
         if marks:
             positions.append((row.x_m, row.y_m))
             images.append(np.array([(mark.offset_x, mark.offset_y) for mark in marks]))
+    detector.refuse_nothing(args.bag, SIZE_OPTION)
     return np.array(positions).reshape(-1, 2), images

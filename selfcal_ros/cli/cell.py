@@ -12,11 +12,12 @@ from pathlib import Path
 from selfcal_ros.cli.camera import pose_text
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
-from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
 from selfcal_ros.outputs import write_bytes
 from selfcal_ros.portable import ended_by_signals
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.drawing import circled
@@ -101,7 +102,13 @@ def _try(args: argparse.Namespace) -> int:
         connected(cell, lambda line: print(line, file=aside(args))) as machine,
     ):
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
-        pixels, marks = trial.look()
+        try:
+            pixels, marks = trial.look()
+        except NoDataError:
+            if trial.seen is not None:
+                write_bytes(output, circled(trial.seen, [], min(trial.seen.shape) / 10))
+                tell(f"{output}: what is seen", aside(args))
+            raise
         print(
             "position: "
             + ", ".join(
@@ -115,8 +122,8 @@ def _try(args: argparse.Namespace) -> int:
         if pixels is not None:
             write_bytes(output, circled(pixels, marks, trial.mark_pixels))
             tell(
-                f"{output}: {len(marks)} marks of {trial.mark_pixels:.3g} pixels in an image of "
-                f"{pixels.shape[1]} x {pixels.shape[0]}",
+                f"{output}: {counted(len(marks), 'mark')} of {trial.mark_pixels:.3g} pixels in "
+                f"an image of {pixels.shape[1]} x {pixels.shape[0]}",
                 aside(args),
             )
         if not args.yes and not _agrees(args, trial.step_m):
@@ -175,12 +182,8 @@ def _agrees(args: argparse.Namespace, step_m: float) -> bool:
         raise InputError(
             "stdin", "there is nobody to ask: it is not a terminal", "give --yes"
         )
-    print(
-        f"the stage moves by up to {step_m / M_PER_UM:.4g} um in x and y: may it? [y/N] ",
-        end="",
-        file=aside(args),
-        flush=True,
-    )
+    tell(f"the stage moves by up to {step_m / M_PER_UM:.4g} µm in x and y", aside(args))
+    print("may it? [y/N] ", end="", file=aside(args), flush=True)
     return input().strip().lower() in ("y", "yes")
 
 

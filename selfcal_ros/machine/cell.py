@@ -156,7 +156,9 @@ class Cell:
             raise MachineError(
                 f"{motion} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
                 f"{self.path}: limits",
-                "correct limits or origin, or take a smaller plan",
+                "correct limits or origin, or take a smaller plan"
+                if start is None
+                else "correct limits or origin, or mark_size: first moves are as long as a mark",
             )
 
 

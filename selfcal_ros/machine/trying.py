@@ -19,6 +19,7 @@ from selfcal_ros.units import NS_PER_S, UM_PER_M
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE, MarkDetector
 from selfcal_ros.vision.images import Picture
+from selfcal_ros.vision.shown import spots_in
 
 PATTERN = (
     (0, 0),
@@ -91,12 +92,18 @@ class Trial:
         Stamps and waits.
     mark_pixels : float
         Size of a mark in the image; 0 = from the pixel size of the cell, or searched for.
+
+    Attributes
+    ----------
+    seen : array (h, w) or None
+        The image of `look`, also if it shows no mark.
     """
 
     cell: Cell
     machine: Machine
     clock: Clock = field(default_factory=Clock)
     mark_pixels: float = 0.0
+    seen: np.ndarray | None = field(default=None, init=False)
 
     def look(self) -> tuple[np.ndarray | None, list[tuple[float, float]]]:
         """Return an image and the columns and rows of its marks; without a camera their offsets, m.
@@ -131,13 +138,20 @@ class Trial:
                 "give detector: {mark: disc, mark_size: ...}, in m",
             )
         picture = visitor.eye.trusted(image_or_offsets, self.position.positions)
+        self.seen = picture.values
         size, marks = self._sized(picture, settings)
         if not marks:
+            spots = spots_in(picture.values)
+            what = (
+                "nothing repeats in it"
+                if spots is None
+                else f"what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+            )
             raise NoDataError(
                 "machine.image",
-                "no mark is found in the image",
-                "move to a mark, focus; check mark, polarity and mark_size in "
-                "CELL.yaml, or give --mark-pixels",
+                f"no mark is found in the image; {what}",
+                "move to a mark, focus; check mark, polarity and mark_size in CELL.yaml, or give "
+                "--mark-pixels",
             )
         self.mark_pixels = size
         in_pixels = replace(
@@ -355,8 +369,8 @@ def _notes(camera: CameraPose | None, reversal: dict[str, FoundValue]) -> Iterat
     for axis, backlash in reversal.items():
         if abs(backlash.value) > max(SIGMAS * backlash.u, LARGE_REVERSAL_M):
             yield (
-                f"{axis} has a backlash of {backlash.value * UM_PER_M:.3g} um (u "
-                f"{backlash.u * UM_PER_M:.2g} um): approach marks from one side, or let the model "
+                f"{axis} has a backlash of {backlash.value * UM_PER_M:.3g} µm (u "
+                f"{backlash.u * UM_PER_M:.2g} µm): approach marks from one side, or let the model "
                 "have the term approach; the map holds for one side only"
             )
 

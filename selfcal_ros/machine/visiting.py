@@ -49,9 +49,9 @@ FOLLOWS = 0.25
 """Largest deviation, over the step, of a position or a mark from the step of the stage."""
 UNITS = {
     1e3: "mm for m",
-    1e6: "um for m",
+    1e6: "µm for m",
     1e-3: "m for mm",
-    1e-6: "m for um",
+    1e-6: "m for µm",
     25.4: "inches",
     1 / 25.4: "inches",
     1 / 0.0254: "inches for m",
@@ -425,7 +425,7 @@ class Visitor:
             self.cell.require_limits(
                 axis,
                 self.cell.to_machine(axis, goal[axis]),
-                "a move",
+                "the end of a move",
                 start=self.cell.to_machine(axis, start[axis]),
             )
         if self.stopped:
@@ -836,7 +836,7 @@ def _change(
 
 
 def _length_text(axis: str, value: float) -> str:
-    return f"{value:.3g} rad" if axis == "theta" else f"{value * UM_PER_M:.4g} um"
+    return f"{value:.3g} rad" if axis == "theta" else f"{value * UM_PER_M:.4g} µm"
 
 
 def _difference(before: EncoderSample, after: EncoderSample) -> Position:

@@ -280,7 +280,7 @@ class MarkDetector:
         return None
 
     def nothing_found(
-        self, picture: Picture | None, rejected: Counter[str]
+        self, picture: Picture | None, *, rejected: Counter[str], size_option: str
     ) -> tuple[str, str]:
         """Return what is wrong with images without a mark, and what to change.
 
@@ -290,6 +290,8 @@ class MarkDetector:
             One of them.
         rejected : Counter
             Reason -> possible marks that were rejected in all of them.
+        size_option : str
+            The option that states the size of a mark, in the unit of `pixel_size`.
         """
         settings = self.settings
         none_found = (
@@ -303,15 +305,15 @@ class MarkDetector:
             return f"{summary}; nothing repeats in them", "check exposure and focus"
         options = []
         if abs(spots.side_px / self.size - 1) > settings.size_tolerance:
-            options.append(f"--mark-size {spots.side_px * settings.pixel_size:.2g}")
+            options.append(f"{size_option} {spots.side_px * settings.pixel_size:.2g}")
         if self._sign and spots.polarity != settings.polarity:
             options.append(f"--polarity {spots.polarity}")
         what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
         return what, (
             f"try {' '.join(options)}"
             if options
-            else "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
-            "corner)?"
+            else "see where they are with selfcal detect --draw FOLDER; another --mark (disc, "
+            "ring, cross, corner)?"
         )
 
     def detections(

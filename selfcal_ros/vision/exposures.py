@@ -146,8 +146,10 @@ class ImageDetector:
         """Return the detections of grey values exposed at `stamp`, ns; raises like `take`."""
         return self._detect(lambda check: picture, stamp, "image")
 
-    def refuse_nothing(self, where: str) -> None:
+    def refuse_nothing(self, where: str, size_option: str = "--mark-size") -> None:
         """Refuse images in which no mark was found, and say what they show instead.
+
+        `size_option` is the option of the command that states the size of a mark.
 
         Raises
         ------
@@ -167,7 +169,10 @@ class ImageDetector:
                 else "record stage/image, or name the folder of the images",
             )
         raise NoDataError(
-            where, *self._detector.nothing_found(self._empty, rejected=counts.rejected)
+            where,
+            *self._detector.nothing_found(
+                self._empty, rejected=counts.rejected, size_option=size_option
+            ),
         )
 
     def _detect(

@@ -248,3 +248,25 @@ def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
         init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 4
     )
     assert problem in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (
+            ["--polarity", "bright"],
+            "no bright disc of 19 px was found; what repeats is",
+        ),
+        (["--mark-pixels", "40"], "try --mark-pixels 19"),
+    ],
+)
+def test_images_without_the_mark_say_what_they_show(tmp_path, capsys, options, said):
+    """And not that the stage is to be moved: the moves are right."""
+    for number, values in enumerate(views(Camera(200, 180, pixel_size_m=2.6e-6))):
+        Image.fromarray(values).save(tmp_path / f"{number}.png")
+    rows = [f"{number}.png,{x},{y}" for number, (x, y) in enumerate(MOVES)]
+    table = tmp_path / "p.csv"
+    table.write_text("\n".join(["file,x,y", *rows]) + "\n")
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(table), *options) == 4
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1 and "move the stage" not in err

@@ -4,6 +4,7 @@
 import io
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def test_what_is_found_is_written_and_the_plan_is_measured_with_it(
     assert main(["cell", "try", "cell.yaml", "--yes", "--json"]) == 0
     out, err = capsys.readouterr()
     said = json.loads(out)
-    assert "cell.seen.png: 1 marks of" in err
+    assert "cell.seen.png: 1 mark of" in err
     with Pillow.open("cell.seen.png") as picture:
         assert picture.size == (220, 200)
         assert (np.asarray(picture) == COLOUR).all(axis=2).sum() > 50
@@ -121,6 +122,30 @@ def test_nothing_moves_or_is_written_without_a_yes(tmp_path, monkeypatch, capsys
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main(["cell", "try", "cell.yaml"]) == 2
     assert "there is nobody to ask" in capsys.readouterr().err
+
+
+def test_without_a_mark_the_picture_shows_what_is_seen(tmp_path, monkeypatch, capsys):
+    """Not found is a mark of the other polarity: the line says what is there."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, cell=MARKS.replace("}", ", polarity: bright}"))
+    assert main(["cell", "try", "cell.yaml", "--yes"]) == 4
+    out, err = capsys.readouterr()
+    assert "cell.seen.png: what is seen" in out
+    assert re.search(
+        r"no mark is found in the image; what repeats is 2\d\S* px, dark", err
+    )
+    with Pillow.open("cell.seen.png") as picture:
+        assert picture.size == (220, 200)
+
+
+def test_marks_in_another_unit_move_nothing(tmp_path, monkeypatch, capsys):
+    """The first moves are by the size of a mark, here 50 for 50e-6."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, cell="detector: {mark: disc, mark_size: 50.0e-3}\n")
+    before = (tmp_path / "cell.yaml").read_text()
+    assert main(["cell", "try", "cell.yaml", "--yes"]) == 2
+    assert "or mark_size: first moves are as long as a mark" in capsys.readouterr().err
+    assert (tmp_path / "cell.yaml").read_text() == before
 
 
 @pytest.mark.parametrize(
