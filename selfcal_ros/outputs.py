@@ -332,8 +332,12 @@ def plain(value: Any) -> Any:
 
 def to_ascii(text: str) -> str:
     """Return `text` in ASCII: known symbols spelled out, others replaced by a question mark."""
-    spelled = "".join(_ASCII.get(char, char) for char in text.replace(" °", "°"))
-    return spelled.encode("ascii", "replace").decode()
+    return spelled_out(text).encode("ascii", "replace").decode()
+
+
+def spelled_out(text: str) -> str:
+    """Return `text` with µ, θ, ° and the like in ASCII; all else is left as it is."""
+    return "".join(_ASCII.get(char, char) for char in text.replace(" °", "°"))
 
 
 def can_print_symbols(stream: TextIO) -> bool:

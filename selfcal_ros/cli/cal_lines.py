@@ -128,7 +128,7 @@ def add_frame(
     """Add the options that relate the controller's axes to the stage frame."""
     group = parser.add_argument_group(
         "machine",
-        ""
+        None
         if default
         else "default: from the comments of FILE.cal, else columns are x and rows are y",
     )
@@ -273,7 +273,7 @@ def add_line_tables(group: argparse._SubParsersAction) -> None:
             help=f"the table that corrects {what}",
             description=f"Write the 1D table that corrects {what}, from a calibration or from "
             "measured errors: a CSV with the header position,error (primary units; "
-            "um, actual - commanded).",
+            "µm, actual - commanded).",
         )
         sub.add_argument("source", metavar="RESULT.json|DATA.csv")
         _common(sub, _line)

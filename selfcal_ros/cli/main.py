@@ -15,7 +15,7 @@ import signal
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from selfcal_ros import __version__
 from selfcal_ros.cli.arguments import add_force, check_existing, misplaced
@@ -43,9 +43,11 @@ from selfcal_ros.start import hold_interrupts
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
 NUMBERS = {
-    "float": "a number; give it without a unit, with a decimal point",
+    "float": "a number; give it{unit} without a unit, with a decimal point",
     "int": "a whole number",
 }
+UNITS = {"DEG": "deg", "M": "m", "MM": "mm", "PX": "pixels", "S": "s", "UM": "µm"}
+"""What stands for a value in the help -> its unit."""
 EXTRAS = {
     "cv2": "camera",
     "distributed": "dask",
@@ -86,9 +88,13 @@ def build_parser(only: str | None = None) -> "Parser":
         )
         if only in (None, name):
             _configure(sub, importlib.import_module(module_of(name)))
-            for words, leaf in _leaves(sub, name):
+            examples = []
+            for words, what, leaf in _leaves(sub, name, VERBS[name].what):
+                leaf.description = leaf.description or what
                 leaf.example = EXAMPLES.get(words, "")
+                examples.append(leaf.example)
                 add_force(leaf)
+            sub.example = "\n  ".join(filter(None, examples))
     if only not in VERBS:
         for name, point in verbs_of_others().items():
             sub = group.add_parser(
@@ -105,18 +111,21 @@ def _configure(parser: argparse.ArgumentParser, module: Any) -> None:
     parser.set_defaults(run=module.run)
 
 
-def _leaves(parser: "Parser", words: str) -> Iterator[tuple[str, "Parser"]]:
-    """Yield the words and the parser of a verb, or of each of its second words."""
+def _leaves(
+    parser: "Parser", words: str, what: str
+) -> Iterator[tuple[str, str, "Parser"]]:
+    """Yield words, what they do and parser of a verb, or of each of its second words."""
     groups = [
         action
         for action in parser._actions
         if isinstance(action, argparse._SubParsersAction)
     ]
     if not groups:
-        yield words, parser
+        yield words, what, parser
     for group in groups:
+        helps = {action.dest: str(action.help) for action in group._choices_actions}
         for word, sub in group.choices.items():
-            yield from _leaves(sub, f"{words} {word}")
+            yield from _leaves(sub, f"{words} {word}", helps[word])
 
 
 def _verb_in(words: Iterable[str]) -> str:
@@ -193,13 +202,27 @@ def _run(words: list[str]) -> int:
 
 def _refused(line: str, code: int) -> int:
     """Print a line on stderr, if somebody reads it, and return the exit code."""
-    for stream, text in ((sys.stdout, ""), (sys.stderr, line + "\n")):
+    for stream, text in (
+        (sys.stdout, ""),
+        (sys.stderr, _shown(line, sys.stderr) + "\n"),
+    ):
         try:
             stream.write(text)
             stream.flush()
         except OSError:  # nobody reads it, or it fills a disk
             say_no_more(stream)
     return int(code)
+
+
+def _shown(text: str, stream: TextIO) -> str:
+    """Return `text`, with µ, ° and the like spelled out if the stream cannot encode it."""
+    try:
+        text.encode(stream.encoding or "ascii")
+    except UnicodeEncodeError:
+        from selfcal_ros.outputs import spelled_out  # slow: numpy
+
+        return spelled_out(text)
+    return text
 
 
 def _remedy(module: str | None) -> str:
@@ -235,6 +258,7 @@ class Parser(argparse.ArgumentParser):
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print help or version; argparse passes over a disk that is full."""
+        message = _shown(message, file or sys.stderr)
         if file is not sys.stdout:
             super()._print_message(message, file)
             return
@@ -242,9 +266,10 @@ class Parser(argparse.ArgumentParser):
         file.flush()
 
     def format_help(self) -> str:
-        """Return the help, with the example as it is typed."""
+        """Return the help, with the example as it is typed, or those of its second words."""
         text = super().format_help()
-        return f"{text}\nexample:\n  {self.example}\n" if self.example else text
+        title = "examples" if "\n" in self.example else "example"
+        return f"{text}\n{title}:\n  {self.example}\n" if self.example else text
 
     def parse_args(  # type: ignore[override]
         self,
@@ -270,7 +295,10 @@ class Parser(argparse.ArgumentParser):
         """End with one line and exit code 2."""
         wrong = NOT_A_NUMBER.fullmatch(message)
         if wrong:
-            message = f"{wrong[1]}: {wrong[3]} is not {NUMBERS[wrong[2]]}"
+            option = self._option_string_actions.get(wrong[1].rpartition("/")[2])
+            unit = UNITS.get(str(option.metavar)) if option else None
+            number = NUMBERS[wrong[2]].format(unit=f" in {unit}," if unit else "")
+            message = f"{wrong[1]}: {wrong[3]} is not {number}"
         required = "the following arguments are required: "
         if message.startswith(required):
             names = message.removeprefix(required).replace("/--", " or --")

@@ -66,6 +66,8 @@ def add_parameters(
         parameter = parameter_of[name]
         default = parameter.default
         suffix = f" (default: {default})" if default else ""
+        what, semicolon, more = parameter.description.partition(";")
+        unit = f", {parameter.unit}" if parameter.unit else ""
         how: dict[str, Any] = (
             {"action": "store_true", "default": None}
             if default is False
@@ -81,7 +83,7 @@ def add_parameters(
         parser.add_argument(
             f"--{option.replace('_', '-')}",
             **how,
-            help=f"{parameter.description}{suffix}".replace("%", "%%"),
+            help=f"{what}{unit}{semicolon}{more}{suffix}".replace("%", "%%"),
         )
 
 

@@ -45,6 +45,13 @@ def test_help_of_a_verb_is_that_of_its_option(capsys):
     )
 
 
+def ends(words):
+    """Run a verb that ends with its help or with a line; return its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    return ended.value.code
+
+
 def leaves(parser, words=()):
     groups = [
         action for action in parser._actions if hasattr(action, "_name_parser_map")
@@ -68,6 +75,44 @@ def test_every_help_has_an_example_that_is_understood(verb):
         build_parser(verb).parse_args(shlex.split(example)[1:])
         for word in shlex.split(example):
             assert not word.startswith(("config/", "bags/")) or (ROOT / word).exists()
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_help_says_what_the_verb_does(verb):
+    for words, leaf in leaves(build_parser(verb)):
+        assert leaf.description, f"selfcal {words} --help does not say what it does"
+
+
+def test_the_help_of_a_verb_of_two_words_has_an_example_of_each(capsys):
+    assert ends(["help", "cal"]) == 0
+    said = capsys.readouterr().out
+    for words, example in EXAMPLES.items():
+        assert (f"\n  {example}\n" in said) == words.startswith("cal ")
+
+
+def test_a_number_with_a_unit_is_told_the_unit_to_use(capsys):
+    """6um is a sensible answer: the line says in which unit it is 6e-6."""
+    assert ends(["detect", "bag", "-o", "b", "--pixel-size", "6um"]) == 2
+    assert (
+        "'6um' is not a number; give it in m, without a unit" in capsys.readouterr().err
+    )
+    assert ends(["help", "detect"]) == 0
+    assert "side of a pixel on the plate, m;" in capsys.readouterr().out
+
+
+def test_help_and_errors_are_readable_where_only_ascii_is():
+    """A stream that has no µ gets a u, and no traceback."""
+    for words, said in (
+        (["gcode", "--help"], "from the programmed one, um"),
+        (["step-diagonal", "--rest-tolerance", "2um"], "give it in um, without a unit"),
+    ):
+        done = subprocess.run(
+            [*SELFCAL, *words],
+            capture_output=True,
+            text=True,
+            env=os.environ | {"PYTHONIOENCODING": "ascii", "COLUMNS": "200"},
+        )
+        assert said in done.stdout + done.stderr, done
 
 
 def test_verbs_are_registered_as_those_of_other_packages_are(tmp_path):
