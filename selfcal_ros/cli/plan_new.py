@@ -58,13 +58,21 @@ PLACING_MIN = {"person": 5.0, "robot": 0.5}
 PIXELS_A_MARK = 12
 """Pixels across a mark of the simulated camera."""
 OWN_KEYS = {
-    "gcode": "{port: /dev/ttyUSB0, dialect: grbl, camera: 0}",
+    "gcode": "{port: /dev/ttyUSB0, dialect: grbl, feed: 600.0, camera: 0}",
     "joint_trajectory": "{joints: [x, y], image: camera/image_raw}",
     "micromanager": "{config: microscope.cfg}",
     "ophyd": "{x: 'beamline:stage.x', y: 'beamline:stage.y', unit: mm, "
     "detector: 'beamline:camera', image: image1.image}",
 }
 """Machine -> its own keys in CELL.yaml, to be edited."""
+KNOWN_AS = {
+    "gcode": "CNC, printer",
+    "joint_trajectory": "ros2_control",
+    "ophyd": "EPICS",
+    "micromanager": "microscope",
+}
+"""Machine -> what its owner calls it."""
+OFTEN = {1: "once", 2: "twice"}
 
 
 @dataclass(frozen=True)
@@ -97,16 +105,25 @@ class Known:
 
 def _length(text: str, option: str) -> float:
     """Return a length with a unit, m."""
+    try:
+        value = length_m(text, option)
+    except InputError:
+        raise InputError(
+            option,
+            f"'{text}' is not a positive length",
+            "write a number with m, mm, um or nm, as in 10mm",
+        ) from None
     if text.strip()[-1:] != "m":
         raise InputError(option, f"'{text}' has no unit", "write for example 10mm")
-    return length_m(text, option)
+    return value
 
 
 def _lengths(text: str, option: str) -> tuple[float, float]:
     """Return one or two lengths such as 100x80mm, m."""
     x, _, y = text.partition("x")
-    unit = re.sub(r"[^a-zµ]", "", y)
-    return _length(x if x.strip()[-1:] == "m" else x + unit, option), _length(
+    unit = re.search(r"[a-zµμ]*\s*$", y)
+    assert unit  # it may be empty
+    return _length(x if x.strip()[-1:] == "m" else x + unit[0], option), _length(
         y or x, option
     )
 
@@ -136,7 +153,7 @@ def _positive(text: str, option: str) -> float:
         value = math.nan
     if not 0 < value < math.inf:
         raise InputError(
-            option, f"'{text}' is not a positive number", "give for example 60"
+            option, f"'{text}' is not a number above 0", "give for example 1.5"
         )
     return value
 
@@ -152,10 +169,21 @@ def _one_of(*words: str) -> Callable[[str, str], str]:
     return read
 
 
+def _known_as(machine: str) -> str:
+    owners = KNOWN_AS.get(machine)
+    return f"{machine} ({owners})" if owners else machine
+
+
 QUESTIONS = (
     Question("travel", "travel of the stage, as in 120mm or 120x100mm", _lengths),
     Question("marks", "marks along a side of the plate, as in 11 or 11x9", _counts),
     Question("pitch", "distance between neighbouring marks, as in 10mm", _length),
+    Question(
+        "machine",
+        f"what is driven: {', '.join(map(_known_as, SHIPPED))}, or another package's",
+        lambda text, option: _one_of(*known_machines())(text, option),
+        "simulated",
+    ),
     Question(
         "lines",
         "angular lines of the plate; 0 = none, or the stage does not turn",
@@ -174,12 +202,6 @@ QUESTIONS = (
     Question("minutes", "minutes that the measurement may take", _positive, "60"),
     Question(
         "seconds", "seconds for a mark: move, come to rest, expose", _positive, "2"
-    ),
-    Question(
-        "machine",
-        f"what is driven: {', '.join(SHIPPED)}, or another package's",
-        lambda text, option: _one_of(*known_machines())(text, option),
-        "simulated",
     ),
 )
 
@@ -223,7 +245,6 @@ def run(args: argparse.Namespace) -> int:
         refuse_existing([path, cell_path], force=args.force)
     answers = _answers(args)
     artifact = _artifact(answers)
-    _require_travel(answers, artifact)
     simulated = answers.machine == "simulated"
     outputs = [path, cell_path, *([simulation] if simulated else [])]
     check_outputs([], outputs)
@@ -267,23 +288,34 @@ def _answers(args: argparse.Namespace) -> Known:
     values: dict[str, Any] = {}
     for item in QUESTIONS:
         answer = getattr(args, item.name)
-        if answer is None and asks:
+        # a camera finds no lines
+        is_settled = (item.name == "lines" and values["machine"] in OWN_KEYS) or (
+            item.name == "field" and values["lines"]
+        )
+        if answer is None and asks and not is_settled:
             values[item.name] = _answer_to(item)
         else:
             text = item.default if answer is None else answer
             values[item.name] = item.read(text, f"--{item.name}")
+        if item.name == "pitch":  # before more is asked
+            _require_travel(
+                values["travel"], _plate(values["marks"], values["pitch"], lines=0)
+            )
     return Known(**values)
 
 
 def _answer_to(item: Question) -> Any:
-    """Ask until the answer can be read."""
+    """Ask until there is an answer that can be read."""
     while True:
         default = f" [{item.default}]" if item.default else ""
         print(f"{item.text}{default}: ", end="", file=sys.stderr, flush=True)
         try:
             text = input().strip() or item.default
         except EOFError:
+            print(file=sys.stderr)
             raise KeyboardInterrupt from None
+        if not text:
+            continue
         try:
             return item.read(text, item.name)
         except InputError as error:
@@ -291,23 +323,34 @@ def _answer_to(item: Question) -> Any:
 
 
 def _artifact(answers: Known) -> Artifact:
-    nx, ny = answers.marks
     if answers.lines and any(answers.field):
         raise InputError(
             "--lines",
             "lines are not found in images, and a camera is given",
             "plan the lines apart, with --field none",
         )
-    return Artifact(nx, answers.pitch, answers.lines, 0 if nx == ny else ny)
+    if answers.lines and answers.machine in OWN_KEYS:
+        raise InputError(
+            "--lines",
+            f"lines are not found in images, and {answers.machine} has nothing but a camera",
+            "leave them out: --lines 0",
+        )
+    return _plate(answers.marks, answers.pitch, answers.lines)
 
 
-def _require_travel(answers: Known, artifact: Artifact) -> None:
+def _plate(marks: tuple[int, int], pitch: float, lines: int) -> Artifact:
+    nx, ny = marks
+    return Artifact(nx, pitch, lines, 0 if nx == ny else ny)
+
+
+def _require_travel(travels: tuple[float, float], artifact: Artifact) -> None:
     """Refuse a plate that the stage cannot pass over."""
     aside = _check_offset_m(artifact)
-    for axis, travel, count in zip("xy", answers.travel, artifact.shape, strict=True):
-        span = (count - 1) * answers.pitch + 2 * aside
+    pitch = artifact.grid_pitch_m
+    for axis, travel, count in zip("xy", travels, artifact.shape, strict=True):
+        span = (count - 1) * pitch + 2 * aside
         if span > travel:
-            fits = int((travel - 2 * aside) / answers.pitch) + 1
+            fits = int((travel - 2 * aside) / pitch) + 1
             mend = (
                 f"take {fits} marks, or marks that are closer"
                 if fits >= 3
@@ -532,7 +575,7 @@ def _text(
     )
     for view in plan.views:
         kind = "" if view.grid else ", lines only"
-        how_often = "once" if view.repeats == 1 else f"{view.repeats} times"
+        how_often = OFTEN.get(view.repeats, f"{view.repeats} times")
         yield f"  {view.name}: {describe_view(view, artifact)}, {how_often}{kind}"
     noise = Assumed()
     yield (

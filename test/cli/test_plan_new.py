@@ -2,15 +2,19 @@
 """``selfcal plan new``: what it writes is accepted by all that read plans, and true."""
 
 import json
+from argparse import Namespace
 from functools import cache
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
 import pytest
 
 from selfcal_ros.cli import plan_new
 from selfcal_ros.cli.main import main
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
-from selfcal_ros.machine.cell import SHIPPED, read_cell
+from selfcal_ros.machine.cell import FOLDER, SHIPPED, read_cell
 from selfcal_ros.settings.estimator import read_plan
 from test.support.disks import files_no_larger_than
 from test.support.terminals import SELFCAL, in_terminal
@@ -115,7 +119,12 @@ def test_the_cell_of_every_machine_can_be_read(machine):
         if data["machine"] == machine
     }
     assert own, f"add an example with `machine: {machine}` to config/cells"
-    assert read_yaml("cell.yaml")[machine].keys() <= next(iter(own.values())).keys()
+    written = read_yaml("cell.yaml")[machine]
+    assert written.keys() <= next(iter(own.values())).keys()
+    module, _, name = SHIPPED[machine].partition(":")
+    arguments = signature(getattr(import_module(module), name)).parameters.values()
+    needed = {item.name for item in arguments if item.default is item.empty}
+    assert needed - {FOLDER} <= written.keys()
     pages = "".join(page.read_text() for page in PAGES.glob("machine*.md"))
     assert any(f"config/cells/{path.name}" in pages for path in own), (
         f"describe it in docs/start/machine_{machine}.md and link that from machines.md"
@@ -150,7 +159,16 @@ def test_a_machine_of_another_package_has_its_cell(tmp_path, monkeypatch):
             "the shortest plan takes 20: 3 placings of 5 minutes",
         ),
         ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
+        (
+            [*STAGE, "--lines", "8", "--machine", "gcode"],
+            "gcode has nothing but a camera",
+        ),
         ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
+        (
+            [*STAGE, "--pitch", "1cm"],
+            "'1cm' is not a positive length; write a number with",
+        ),
+        ([*STAGE, "--travel", "50x40x5mm"], "'40x5mm' is not a positive length"),
         ([*STAGE, "--marks", "2"], "is not a number from 3"),
         ([*STAGE, "--marks", "٧"], "'٧' is not a whole number"),
         (["--marks", "5"], "--travel: is missing, and there is nobody to ask"),
@@ -186,10 +204,37 @@ def test_a_cell_that_another_command_wrote_meanwhile_stays(monkeypatch, capsys):
 
 
 def test_a_person_is_asked_in_a_terminal(tmp_path):
-    answers = b"fifty\n50mm\n5\n10mm\n\n\nrobot\n4\n1\n\n"
+    answers = b"fifty\n\n50mm\n5\n10mm\n\n\n\nrobot\n4\n1\n"
     code, said = in_terminal(
         [*SELFCAL, "plan", "new", "-o", "plan.yaml"], folder=tmp_path, keys=answers
     )
     assert code == 0, said
-    assert "'fifty' has no unit" in said and "it identifies the stage" in said
+    assert (
+        "'fifty' is not a positive length; write a number with m, mm, um" in said
+        and "it identifies the stage" in said
+    )
     assert "placings of 0.5 minutes" in said and "exposures of 1 s" in said
+
+
+@pytest.mark.parametrize(
+    ("answers", "not_asked"),
+    [
+        ("50mm 5 10mm gcode none robot 4 1", "angular lines"),
+        ("50mm 5 10mm simulated 8 robot 9 1", "what the camera sees"),
+        ("30mm 5 10mm", "what is driven"),
+    ],
+    ids=["a camera finds no lines", "lines without a camera", "too long a plate"],
+)
+def test_what_is_settled_is_not_asked(answers, not_asked, monkeypatch, capsys):
+    """Of a plate that does not fit the rest is not asked: its answers would be lost."""
+    given = iter(answers.split())
+    monkeypatch.setattr("builtins.input", lambda: next(given))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    nothing = Namespace(**{item.name: None for item in plan_new.QUESTIONS})
+    try:
+        known = plan_new._answers(nothing)
+    except InputError as error:
+        assert "30 mm along x" in str(error) and "take 3 marks" in str(error)
+    else:
+        assert known.machine == "gcode" or known.lines == 8
+    assert not_asked not in capsys.readouterr().err and not list(given)
