@@ -9,6 +9,7 @@ from selfcal_ros.outputs import check_outputs
 from selfcal_ros.reporting.artwork import PAPERS_MM, artwork_of, save_artwork
 from selfcal_ros.settings.detector import MARKS
 from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.units import MM_PER_M
 
 ON_PAPER = (
     "paper and a printer are true to about 0.1 mm: enough to try a camera or a printer's "
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     save_artwork(art, args.output, args.paper or "")
     left, low, right, high = art.box
     lines = [
-        f"{args.output}: {plan.artifact.m.size} marks ({args.mark}, {size:g} m), "
+        f"{args.output}: {plan.artifact.m.size} marks ({args.mark}, {size * MM_PER_M:.4g} mm), "
         f"{plan.artifact.angular_count} lines, {right - left:.4g} x {high - low:.4g} mm; the "
         "dot beyond a corner is beside mark (h, h), the numbers are m and n",
         *([ON_PAPER] if args.paper else []),

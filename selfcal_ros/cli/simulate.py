@@ -38,7 +38,10 @@ def run(args: argparse.Namespace) -> int:
     say(
         args,
         f"{args.output}: "
-        + ", ".join(f"{count} x {topic}" for topic, count in counts.items()),
+        + ", ".join(
+            f"{count} {topic}" if args.png else f"{count} x {topic}"
+            for topic, count in counts.items()
+        ),
         {"bag": args.output, "messages": dict(counts)},
     )
     return 0
