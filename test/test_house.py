@@ -120,6 +120,19 @@ def test_every_module_names_its_licence():
     assert [path for path in SOURCES if not source(path).text.startswith(first)] == []
 
 
+def test_people_read_micrometres():
+    """`um` is what is typed, and what stands in files and names that are ASCII."""
+    in_ascii = {"compensation/export.py", "nodes/filling.py"}  # comments; RViz's font
+    found = [
+        f"{path.relative_to(PACKAGE)}: {line.strip()}"
+        for path in SOURCES
+        for line in source(path).text.splitlines()
+        if re.search(r"\} um\b", line)
+        and str(path.relative_to(PACKAGE)) not in in_ascii
+    ]
+    assert not found
+
+
 def test_no_stub_is_left():
     words = ("TO" + "DO", "FIX" + "ME", "NotImplemented" + "Error", "XX" + "X")
     for path in SOURCES:

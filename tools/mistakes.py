@@ -272,7 +272,7 @@ MISTAKES = [
                 ("huge", 2, "grid_size.*4001|401"),
                 ("negative", 2, "grid_pitch.*-0.01"),
                 ("half", 2, "translation_pitch"),
-                ("um", 2, "is it in um"),
+                ("um", 2, "is it in µm"),
                 ("quoted", 2, "write 0.01, with a decimal point"),
                 ("unit", 2, "without a unit"),
                 ("term", 2, r"write \[drift\]"),

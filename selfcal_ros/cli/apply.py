@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.cli.deliver import deliver
-from selfcal_ros.cli.terminal import add_json, file_of
+from selfcal_ros.cli.terminal import add_json, file_of, tell
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import csv_cells, read_text
@@ -148,10 +148,10 @@ def _say_better(stage: StageMap, points: np.ndarray) -> None:
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:
-        print(
+        tell(
             "selfcal apply: between the nodes u is mostly that of bilinear interpolation, "
-            f"{used * UM_PER_M:.2g} um halfway; with --method bicubic {cubic * UM_PER_M:.2g} um",
-            file=sys.stderr,
+            f"{used * UM_PER_M:.2g} µm halfway; with --method bicubic {cubic * UM_PER_M:.2g} µm",
+            sys.stderr,
         )
 
 
@@ -252,10 +252,10 @@ def distances(
         error = np.where(outside, np.nan, error)
     for where, anywhere in (("anywhere in the field", True), ("of two nodes", False)):
         a, b = stage.length_uncertainty(anywhere=anywhere)
-        print(
-            f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} um + "
-            f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
-            file=sys.stderr,
+        tell(
+            f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} µm + "
+            f"{b * UM_PER_M:.3g} µm/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
+            sys.stderr,
         )
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
     unknown = int((np.isnan(error) & ~outside).sum())

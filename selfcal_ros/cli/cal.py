@@ -319,7 +319,7 @@ def add_maps(group: argparse._SubParsersAction) -> None:
     export.set_defaults(run_sub_verb=_export)
     verify = group.add_parser(
         "verify",
-        help="print the residual of a simulated controller before and after a file is loaded, um",
+        help="print the residual of a simulated controller before and after a file is loaded, µm",
     )
     verify.add_argument("result", metavar="RESULT.json")
     verify.add_argument(
@@ -442,11 +442,11 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 def say_bent(args: argparse.Namespace, bent_m: float) -> None:
     """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
     if bent_m >= LEAST_BEND_M:
-        print(
+        tell(
             f"{args.leaf.prog}: --onto: the active table is curved between the nodes of the "
-            f"map by up to {bent_m / M_PER_UM:.3g} um, which the new table does not reproduce; "
+            f"map by up to {bent_m / M_PER_UM:.3g} µm, which the new table does not reproduce; "
             "calibrate with the nodes of that table, or without it",
-            file=sys.stderr,
+            sys.stderr,
         )
 
 

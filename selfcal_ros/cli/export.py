@@ -9,7 +9,7 @@ from selfcal_ros.applications.controllers.grid import Source, Wiring
 from selfcal_ros.cli.cal import figures_of, numbered, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, exit_code, say
+from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 
@@ -85,9 +85,9 @@ def run(args: argparse.Namespace) -> int:
     )
     say_bent(args, exported.bent_m)
     if exported.remains:
-        print(
+        tell(
             f"selfcal export: {args.format} cannot hold the whole map: {exported.remains}",
-            file=sys.stderr,
+            sys.stderr,
         )
     backups = replace_files(args, exported.files, [args.result, *(args.onto or ())])
     lines = [path + replaced(backup) for path, backup in backups.items()]

@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="UM",
-        help="largest distance of the corrected path from the programmed one, um (default 1)",
+        help="largest distance of the corrected path from the programmed one, µm (default 1)",
     )
     add(
         "--decimals",
@@ -91,13 +91,13 @@ def run(args: argparse.Namespace) -> int:
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
         raise InputError(
             "--tolerance, --decimals",
-            f"{args.tolerance} um, {args.decimals}",
-            "give 0.001 to 10000 um and 1 to 9 decimals",
+            f"{args.tolerance} µm, {args.decimals}",
+            "give 0.001 to 10000 µm and 1 to 9 decimals",
         )
     if 10.0**-args.decimals * 1e3 > 2 * args.tolerance:
         raise InputError(
             "--decimals",
-            f"{args.decimals} round by more than {args.tolerance:g} um",
+            f"{args.decimals} round by more than {args.tolerance:g} µm",
             "give more, or a larger --tolerance",
         )
     args.unit = args.unit or "mm"

@@ -164,7 +164,7 @@ def run(args: argparse.Namespace) -> int:
     result = outcome(identified, data, line=ReferenceLine(args.line), warnings=warnings)
     result["input"] = source
     for warning in result["warnings"]:
-        print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
+        tell(f"selfcal step-diagonal: warning: {warning}", sys.stderr)
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
@@ -392,7 +392,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=2.0,
         metavar="UM",
-        help="largest motion of an axis at rest, um (default 2)",
+        help="largest motion of an axis at rest, µm (default 2)",
     )
     group.add_argument(
         "--min-rest",

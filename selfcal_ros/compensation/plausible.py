@@ -34,7 +34,7 @@ def require_plausible(
             x, y = plate.x_m[i, j] * MM_PER_M, plate.y_m[i, j] * MM_PER_M
             raise InputError(
                 where,
-                f"{name} changes by {steps[i, j] * UM_PER_M:.4g} um from the node at "
+                f"{name} changes by {steps[i, j] * UM_PER_M:.4g} µm from the node at "
                 f"({x:g}, {y:g}) mm to the next along {'xy'[axis]}, "
                 f"{pitch_m * MM_PER_M:g} mm away: is it real?",
                 f"check the readings there; if it is, {accept}",

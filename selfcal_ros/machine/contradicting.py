@@ -67,7 +67,7 @@ def _reversal(
     x, y = np.abs(2 * slope) * UM_PER_M
     return Contradiction(
         explained,
-        f"marks approached from + and from - lie {x:.3g} um apart in x and {y:.3g} um "
+        f"marks approached from + and from - lie {x:.3g} µm apart in x and {y:.3g} µm "
         "in y: backlash",
         "take up the play, or have all marks approached from one side",
     )
@@ -88,8 +88,8 @@ def _jump(
             x, y = slope * UM_PER_M
             best = Contradiction(
                 explained,
-                f"from visit {number + 2} on all marks lie {x:+.3g} um in x and "
-                f"{y:+.3g} um in y from where they were: steps were lost, or the plate or the "
+                f"from visit {number + 2} on all marks lie {x:+.3g} µm in x and "
+                f"{y:+.3g} µm in y from where they were: steps were lost, or the plate or the "
                 "camera has slipped",
                 "fasten plate and camera, move more slowly, home the stage",
             )
@@ -105,6 +105,6 @@ def _running(
     x, y = slope * UM_PER_M
     return Contradiction(
         explained,
-        f"the marks run away by {x:+.3g} um in x and {y:+.3g} um in y over the view",
+        f"the marks run away by {x:+.3g} µm in x and {y:+.3g} µm in y over the view",
         "see whether the stage loses steps, or plate, camera or temperature drift",
     )

@@ -464,7 +464,7 @@ class Run:
             return False
         self.desk.say(
             f"view '{view.name}': its marks lie {x * UM_PER_M:+.3g}, "
-            f"{y * UM_PER_M:+.3g} um from where they were: the plate was moved, or the "
+            f"{y * UM_PER_M:+.3g} µm from where they were: the plate was moved, or the "
             "stage has another zero; the view is measured anew"
         )
         return True

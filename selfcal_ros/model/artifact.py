@@ -129,7 +129,7 @@ class Artifact:
                 "artifact grid_pitch",
                 f"{self.grid_pitch_m:g} m is not a pitch of a plate "
                 f"({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
-                f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'um'}? give the "
+                f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'µm'}? give the "
                 "distance between marks in metres",
             )
         if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:

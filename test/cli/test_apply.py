@@ -143,7 +143,7 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
         a, b = StageMap(result).length_uncertainty(anywhere=anywhere)
         where = "anywhere in the field" if anywhere else "of two nodes"
         assert (
-            f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
+            f"U of a distance L {where} is at most {1e6 * a:.3g} µm + {1e6 * b:.3g} µm/m L"
             in line
         )
     assert outside.startswith("selfcal apply: points outside the field, left empty (")

@@ -83,7 +83,7 @@ def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, 
     assert main(line.split()) == 2
     err = capsys.readouterr().err
     assert re.search(
-        r": R.json: gx changes by 1[45]\d(\.\d)? um from the node at \((0|10), -10\) "
+        r": R.json: gx changes by 1[45]\d(\.\d)? µm from the node at \((0|10), -10\) "
         r"mm to the next along x, 10 mm away: is it real\?; check the readings there; "
         r"if it is, add --steep\n$",
         err,
@@ -130,7 +130,7 @@ def test_the_checklist_names_files_axes_and_the_place_to_look_at(capsys, name, s
     assert all(any(part in step for step in steps) for part in said)
     found = re.match(
         r"the correction is largest at x = (\S+) mm, y = (\S+) mm: relative to zero "
-        r"the axes go (\S+) um and (\S+) um further there; measure it",
+        r"the axes go (\S+) µm and (\S+) µm further there; measure it",
         look,
     )
     x, y, cx, cy = map(float, found.groups())
@@ -151,9 +151,9 @@ def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
     before, after = map(float, out.splitlines()[3].split()[-2:])
     assert (
         "cannot hold the whole map: left at the nodes on a simulated controller: "
-        f"{after:.3g} um rms"
+        f"{after:.3g} µm rms"
         in err
-        and f"of {before:.3g} um rms" in err
+        and f"of {before:.3g} µm rms" in err
     )
     rows = [
         list(map(float, row.split()))

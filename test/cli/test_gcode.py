@@ -80,15 +80,15 @@ def test_the_json_has_the_program_and_the_unit_is_that_of_home_alone(capsys):
         ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
         (
             "in.nc R.json -o o.nc --tolerance 0",
-            "--tolerance, --decimals: 0.0 um, 5; give",
+            "--tolerance, --decimals: 0.0 µm, 5; give",
         ),
         (
             "in.nc R.json -o o.nc --decimals 12",
-            "--tolerance, --decimals: 1.0 um, 12; give",
+            "--tolerance, --decimals: 1.0 µm, 12; give",
         ),
         (
             "in.nc R.json -o o.nc --decimals 2",
-            "--decimals: 2 round by more than 1 um; give more",
+            "--decimals: 2 round by more than 1 µm; give more",
         ),
         ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes"),
     ],

@@ -31,7 +31,7 @@ AT_THE_FIRST_MOVE = [
     ("frozen position", "nothing moved: its position is frozen"),
     ("stands still", "nothing moved: its position is frozen"),
     ("position in mm", "1e\\+03 times as far: is it mm for m?"),
-    ("position in um", "1e\\+06 times as far: is it um for m?"),
+    ("position in um", "1e\\+06 times as far: is it µm for m?"),
     ("position in inches", "39 times as far: is it inches for m?"),
     ("x is reversed", "the opposite direction: x is reversed"),
     ("y is reversed", "the opposite direction: y is reversed"),
@@ -66,7 +66,7 @@ AT_THE_FIRST_MARK = [
     ("of sixteen bits", "black, grey values up to 2.. of 65535.*full_scale"),
     ("of half the size", "nothing is seen at the first 5 stops.*pixel_size"),
     ("no image", "nothing is seen at the first 5 stops; the machine returns no images"),
-    ("offsets in um", "is it um for m?"),
+    ("offsets in um", "is it µm for m?"),
     ("offsets are reversed", "the opposite direction: x is reversed"),
     ("offsets are exchanged", "y moved instead: the axes are exchanged"),
 ]
@@ -98,13 +98,13 @@ OF_THE_STAGE = [
     ("frozen position", "nothing moved: its position is frozen"),
     ("stands still", "nothing moved.* its drive is off"),
     ("limit switch", "x was sent to .* limit switch"),
-    ("ends short", "x was sent to .*, -100 um away"),
+    ("ends short", "x was sent to .*, -100 µm away"),
     ("never at rest", "x (does not come to rest|moved by)"),
     ("creeps at rest", "y (does not come to rest|moved by)"),
-    ("sways", "x moved by -?3 um during 3 exposures"),
+    ("sways", "x moved by -?3 µm during 3 exposures"),
     ("replies of another axis", "it answers for the other axis"),
-    ("zero lost at rest", "x has changed by 3000 um at rest, without a command"),
-    ("moved by hand", "y has changed by 50 um at rest, without a command"),
+    ("zero lost at rest", "x has changed by 3000 µm at rest, without a command"),
+    ("moved by hand", "y has changed by 50 µm at rest, without a command"),
 ]
 OF_IMAGES = [
     ("no answer of the camera", "machine.image: TimeoutError: no answer in 5 s"),
@@ -212,10 +212,10 @@ NOT_SHOWN_BY_THE_POSITION = [
     (
         "backlash of 5 um",
         0,
-        r"lie (4|5)[.]?\d* um apart in x and (4|5)[.]?\d* um in y: backlash",
+        r"lie (4|5)[.]?\d* µm apart in x and (4|5)[.]?\d* µm in y: backlash",
     ),
-    ("steps were lost once", 40, r"[+]20 um in x and .* steps were lost"),
-    ("loses steps", 0, r"the marks run away by [+]\d+ um in x"),
+    ("steps were lost once", 40, r"[+]20 µm in x and .* steps were lost"),
+    ("loses steps", 0, r"the marks run away by [+]\d+ µm in x"),
 ]
 
 

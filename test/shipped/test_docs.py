@@ -111,7 +111,7 @@ def test_the_security_page_states_the_bounds_of_the_code():
         f"results up to {LARGEST_FILE >> 20} MB and a million values",
         f"`max_correction` ({compensator.max_correction * 1e3:g} mm ",
         f"{LEAST_RADIUS_M * 1e3:g} mm from the axis",
-        f"steeper than {100 * PLAUSIBLE:g} % of the pitch or {PLAUSIBLE_M * 1e6:g} um",
+        f"steeper than {100 * PLAUSIBLE:g} % of the pitch or {PLAUSIBLE_M * 1e6:g} µm",
     ):
         assert bound in stated
     assert MAX_JSON_VALUES == 10**6 and SETTLED == 3 and "Once three images" in stated

@@ -35,6 +35,7 @@ from selfcal_ros.compensation.residual import (
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import spelled_out
 from selfcal_ros.units import UM_PER_M
 
 HELD = 0.01
@@ -254,10 +255,9 @@ def export(
     if active is not None:
         comments.append(
             "replaces the table that was loaded during the calibration; what that "
-            f"bends between the nodes of the map, up to {UM_PER_M * bent:.3g} um, is "
-            "lost"
+            f"bends between the nodes of the map, up to {UM_PER_M * bent:.3g} µm, is lost"
         )
-    head = [form.comment + _plain(line) for line in comments]
+    head = [form.comment + spelled_out(_plain(line)) for line in comments]
     files = {
         names[part]: "\n".join(
             [*lines, "", *head] if form.comments_last else [*head, *lines]
@@ -328,8 +328,8 @@ def place_to_look(frame: MachineFrame, correct: Correction, table: ErrorMap) -> 
     most = int(np.argmax(np.hypot(cx, cy)))
     return (
         f"the correction is largest at x = {px[most]:.6g} {frame.unit}, y = {py[most]:.6g} "
-        f"{frame.unit}: relative to zero the axes go {UM_PER_M * cx[most]:+.4g} um and "
-        f"{UM_PER_M * cy[most]:+.4g} um further there; measure it: the error must shrink, not "
+        f"{frame.unit}: relative to zero the axes go {UM_PER_M * cx[most]:+.4g} µm and "
+        f"{UM_PER_M * cy[most]:+.4g} µm further there; measure it: the error must shrink, not "
         "double"
     )
 
@@ -338,8 +338,8 @@ def _remaining_text(sites: Residual) -> str:
     """Return what remains at the nodes, in words."""
     rms, largest = (UM_PER_M * size("after") for size in (sites.rms, sites.largest))
     return (
-        f"left at the nodes on a simulated controller: {rms:.3g} um rms, largest "
-        f"{largest:.3g}, of {UM_PER_M * sites.rms('before'):.3g} um rms"
+        f"left at the nodes on a simulated controller: {rms:.3g} µm rms, largest "
+        f"{largest:.3g}, of {UM_PER_M * sites.rms('before'):.3g} µm rms"
     )
 
 

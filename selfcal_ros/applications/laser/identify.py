@@ -330,8 +330,8 @@ def _contradiction(
         return ""
     contradiction = (
         f"the readings of the diagonals contradict each other by "
-        f"{residual_m * UM_PER_M:.3g} um rms, where their repeats allow "
-        f"{expected_m * UM_PER_M:.3g} um; errors are beyond their u: "
+        f"{residual_m * UM_PER_M:.3g} µm rms, where their repeats allow "
+        f"{expected_m * UM_PER_M:.3g} µm; errors are beyond their u: "
     )
     samples = data.samples_m.copy()
     samples[:, data.signs < 0] = samples[:, data.signs < 0][:, :, ::-1]

@@ -185,7 +185,7 @@ def _advice(result: StepDiagonalResult) -> list[str]:
     ):
         out.append(
             f"the diagonals differ from those calculated from the linear errors by "
-            f"{lengths * UM_PER_M:.3g} um: the laser is off the machine's diagonal, or "
+            f"{lengths * UM_PER_M:.3g} µm: the laser is off the machine's diagonal, or "
             "the linear errors are of another state of the machine"
         )
     if result.closure.contradiction:
@@ -205,7 +205,7 @@ def _set_up(result: StepDiagonalResult) -> list[str]:
     x, y = (result.n_blocks * step for step in result.steps_m[:2])
     if result.method == Method.CONVENTIONAL:
         wrong = (
-            f"1 mrad on one diagonal adds {1e-3 * y / 2 * UM_PER_M:.3g} um to Px(x)"
+            f"1 mrad on one diagonal adds {1e-3 * y / 2 * UM_PER_M:.3g} µm to Px(x)"
             if result.dim == 2
             else "squareness as well"
         )
@@ -225,7 +225,7 @@ def _set_up(result: StepDiagonalResult) -> list[str]:
     return [
         f"the mirror is off the laser by up to {np.abs(angles).max() * MRAD_PER_RAD:.3g} mrad: "
         f"where the laser is {LASER_OFF_RAD * MRAD_PER_RAD:g} mrad off the machine's diagonal, "
-        f"squareness errs by {off_m * UM_PER_M:.2g} um, which u does not contain; turn the "
+        f"squareness errs by {off_m * UM_PER_M:.2g} µm, which u does not contain; turn the "
         "mirror square to the laser"
     ]
 

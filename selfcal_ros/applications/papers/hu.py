@@ -220,7 +220,7 @@ def hu_text(reproduction: HuReproduction) -> str:
         "Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
         "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
         "readings at once",
-        f"without noise the law errs by {reproduction.noise_free_um:.1e} um, "
+        f"without noise the law errs by {reproduction.noise_free_um:.1e} µm, "
         f"{reproduction.noise_free_deg:.1e} deg",
         "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
         "map's error, so that it may lie below",
@@ -233,19 +233,19 @@ def hu_text(reproduction: HuReproduction) -> str:
 def _table_text(run: HuRun, n_draws: int) -> list[str]:
     table = run.published
     lines = [
-        f"{table.name}: noise {table.sigma_um:g} um, {table.sigma_deg:g} deg",
+        f"{table.name}: noise {table.sigma_um:g} µm, {table.sigma_deg:g} deg",
         f"{'':10}{'published':^33} {'law, first draw':^33} "
-        f"{f'std of {n_draws} draws, mean +- spread':^46}",
+        f"{f'std of {n_draws} draws, mean ± spread':^46}",
         f"{'':10}{'max':>11}{'min':>11}{'std':>11} {'max':>11}{'min':>11}{'std':>11} "
         f"{'law':>22}{'joint':>22}{'bound':>11}",
     ]
-    names = ("EGx, um", "EGy, um", "EGth, deg")
+    names = ("EGx, µm", "EGy, µm", "EGth, deg")
     bounds = (run.bound[0], run.bound[0], run.bound[1])
     first = run.law.first
     for row, name in enumerate(names):
         cells = [f"{value:11.4g}" for value in (*table.table[row], *first[row])]
         spreads = [
-            f"{errors.std[:, row].mean():.4g} +- {_spread(errors.std[:, row]):.2g}"
+            f"{errors.std[:, row].mean():.4g} ± {_spread(errors.std[:, row]):.2g}"
             for errors in (run.law, run.joint)
         ]
         lines.append(
@@ -274,7 +274,7 @@ def _series_text(run: HuRun) -> list[str]:
             f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws"
         )
         for column in columns:
-            name = ("x, um", "y, um", "theta, deg")[column]
+            name = ("x, µm", "y, µm", "theta, deg")[column]
             values = " ".join(
                 f"{value:.2e}" if column == 2 else f"{value:.4f}"
                 for value in run.law.std[:n, column]

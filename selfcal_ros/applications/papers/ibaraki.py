@@ -119,7 +119,7 @@ def ibaraki_text(reproduction: IbarakiReproduction) -> str:
         )
     lines += [
         "",
-        f"Table 2 and text: case study, 60 mm, 6 blocks, um; ours: mean of {n} "
+        f"Table 2 and text: case study, 60 mm, 6 blocks, µm; ours: mean of {n} "
         "simulated measurements",
         f"{'':16}{'measured':>10}{'new:':>8}{'published':>10}{'ours':>8}"
         f"{'conventional:':>16}{'published':>10}{'ours':>8}",
@@ -135,7 +135,7 @@ def ibaraki_text(reproduction: IbarakiReproduction) -> str:
             *lines,
             "The readings are not published. Ours are of a simulated machine with the "
             "measured errors, 10 nm of noise and mirrors "
-            f"{MIRROR_RAD * URAD_PER_RAD:g} urad off,",
+            f"{MIRROR_RAD * URAD_PER_RAD:g} µrad off,",
             "which explains the published positions of the conventional formulation.",
         ]
     )

@@ -305,7 +305,7 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
     lines += [
         f"{equal} of {reproduction.ranks.size} ranks as printed (marked =)",
         "",
-        "Figure 3: without noise, n = 11, stage and plate errors of 1 um",
+        "Figure 3: without noise, n = 11, stage and plate errors of 1 µm",
     ]
     for number, (program, published) in enumerate(
         zip(
@@ -325,7 +325,7 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
         )
         lines.append(
             f"  program {number}, {' + '.join(program.views)}: rms error "
-            f"{program.rms_um:.3g} um{how}; published: {published}"
+            f"{program.rms_um:.3g} µm{how}; published: {published}"
         )
     return "\n".join([*lines, "", *_noise_text(reproduction)])
 
@@ -337,11 +337,11 @@ def _noise_text(reproduction: QiaoReproduction) -> list[str]:
         rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um)
     )
     return [
-        f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
-        f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
-        f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
-        f"  rms over all draws: {over_draws:.4f} um; published {PUBLISHED_MEAN_UM} um",
-        f"  bound of any unbiased estimator: {reproduction.bound_um:.4f} um",
+        f"Figure 4: noise of standard deviation 0.1 µm, program 1, {n} draws",
+        f"  rms error of one draw: x {x:.4f} µm, y {y:.4f} µm; published "
+        f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} µm",
+        f"  rms over all draws: {over_draws:.4f} µm; published {PUBLISHED_MEAN_UM} µm",
+        f"  bound of any unbiased estimator: {reproduction.bound_um:.4f} µm",
         "  The published figure lies below that bound, so that it is not reproducible as printed.",
-        f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used.",
+        f"  Noise uniform within ±0.1 µm gives {uniform:.4f} µm: probably this was used.",
     ]

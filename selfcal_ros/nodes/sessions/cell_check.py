@@ -793,7 +793,7 @@ class CellCheck:
         if stops and not offsets_follow and not what and moved_um > 0:
             what = (
                 f"the offsets do not follow the stage: between the stops at a mark it moves by "
-                f"{moved_um:.3g} um rms, they by {seen_um:.3g} um"
+                f"{moved_um:.3g} µm rms, they by {seen_um:.3g} µm"
             )
             remedy = (
                 "measure the offset anew in each image, and publish it in m: check the unit "

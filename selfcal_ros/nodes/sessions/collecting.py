@@ -582,9 +582,10 @@ class CollectingSession:
             if math.isfinite(value):
                 values[f"{name}_{unit}"] = f"{value * scale:.4g}"
             if 0 < limit < value:
+                symbol = "µm" if unit == "um" else unit
                 problems.append(
-                    f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
-                    f"limit {limit * scale:.3g} {unit}"
+                    f"{name.replace('_', ' ')} is {value * scale:.3g} {symbol}, the "
+                    f"limit {limit * scale:.3g} {symbol}"
                 )
         return Diagnosis(
             Level.WARN if problems else Level.OK, "; ".join(problems), values

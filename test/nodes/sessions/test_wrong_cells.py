@@ -278,7 +278,7 @@ WRONG = [
         "signs",
         "the offsets do not follow the stage: between the stops at a mark",
     ),
-    ("offsets 1000 times too small", "signs", "it moves by 27 um rms, they by 0.05"),
+    ("offsets 1000 times too small", "signs", "it moves by 27 µm rms, they by 0.05"),
     ("backlash", "marks", "16 outlier_among_repeats"),
     ("m and n exchanged", "ids", "m and n are exchanged"),
     ("x and y exchanged", "ids", "x and y are exchanged"),
