@@ -25,7 +25,7 @@ MEASURE, LOOK, USE, CERTIFY, CHECK, MORE = GROUPS = (
 )
 
 START_HERE = {
-    "plan check PLAN.yaml": "do these views determine the stage?",
+    "plan new -o PLAN.yaml": "asks, and writes plan and cell",
     "up --plan PLAN.yaml --simulate": "measure, here on a simulated machine",
     "solve BAG -o RESULT.json": "from a bag: the map and its U",
     "report RESULT.json": "all of it on one page",

@@ -27,7 +27,7 @@ def test_the_laser_is_doubted_beyond_2_ppm_of_the_diagonal(steps, blocks, ppm, a
     off_um = ppm * np.hypot(*steps) * blocks
     expected = [
         f"the diagonals differ from those calculated from the linear errors by "
-        f"{off_um:.3g} um: the laser is off the machine's diagonal, or the linear errors "
+        f"{off_um:.3g} µm: the laser is off the machine's diagonal, or the linear errors "
         "are of another state of the machine"
     ]
     found = outcome(identify_ibaraki(data), data, warnings=["before"])

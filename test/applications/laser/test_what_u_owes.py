@@ -76,7 +76,7 @@ def test_linear_errors_of_nominal_directions_have_no_u():
     assert result["u_ex_y"][0] > 0
     assert u_profile_m(found, 0, 0) is None and u_profile_m(found, 0, 1) is not None
     assert abs(result["profiles"]["px_x"]["error"][-1]) > 0.025
-    assert "1 mrad on one diagonal adds 30 um to Px(x)" in result["warnings"][-1]
+    assert "1 mrad on one diagonal adds 30 µm to Px(x)" in result["warnings"][-1]
 
 
 def test_identical_repeats_show_no_uncertainty_although_their_mean_is_rounded():
@@ -99,4 +99,4 @@ def test_a_mirror_far_off_the_laser_is_named_with_what_a_laser_off_its_diagonal_
     off_um = abs(squareness(found).value - truth) * 1e6
     warnings = outcome(found, data)["warnings"]
     assert off_um > 0.04
-    assert len(warnings) == 1 and "squareness errs by 0.035 um" in warnings[0]
+    assert len(warnings) == 1 and "squareness errs by 0.035 µm" in warnings[0]
