@@ -28,7 +28,8 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
 
     Marks beyond the field of the stage are hollow: no view reads them.
     """
-    drawing = parts.titled("views", "How the plate lies in every view")
+    title = "How the plate lies in every view" if len(views) > 1 else "Place the plate"
+    drawing = parts.titled("views", title)
     margin = 2.6 * artifact.grid_pitch_m
     reach = [(half + margin) * MM_PER_M for half in artifact.field_half_m]
     if artifact.map_grid is not None:  # the corners may reach far beyond the field
@@ -43,8 +44,10 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     for frame, view in zip(parts.panels(drawing, titles, reach), views, strict=True):
         _plate(frame, view, artifact)
         frame.border()
+    turn = "; arrow: its turn" * any(view.rotation_rad for view in views)
     legend = [
-        "shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
+        "stage x to the right, y upwards; shaded: its field",
+        f"dot: corner (h, h) of the plate{turn}",
         "small dots: only lines are read; hollow: off the field, not read",
     ]
     if aside := {view.check_offset_m for view in views if view.check_marks}:

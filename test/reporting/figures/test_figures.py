@@ -401,6 +401,19 @@ def test_courses_need_times_and_show_a_rise_upwards():
     assert courses(found[1:], 1e-8) is None
 
 
+def test_the_plate_of_one_view_is_shown_with_the_axes_and_what_is_there():
+    """For whoever places it: without a turn no arrow is explained, and x and y are."""
+    plate = Artifact(5, 0.01, 0)
+    for views, title, arrow in (
+        ([View("a")], "Place the plate", False),
+        ([View("a", np.pi / 2)], "Place the plate", True),
+        ([View("a"), View("b", np.pi / 2)], "How the plate lies in every view", True),
+    ):
+        said = svg_file(plan_figure(plate, views))
+        assert title in said and "stage x to the right, y upwards" in said
+        assert ("arrow: its turn" in said) is arrow
+
+
 def turned(rotation_deg, shift=(0.0, 0.0), grid=None, **more):
     """Return the figure of one view of a plate of 5 x 9 marks, and the middle of its panel."""
     view = View("v", math.radians(rotation_deg), shift, **more)
