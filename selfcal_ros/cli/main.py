@@ -217,7 +217,7 @@ def _refused(line: str, code: int) -> int:
 def _shown(text: str, stream: TextIO) -> str:
     """Return `text`, with µ, ° and the like spelled out if the stream cannot encode it."""
     try:
-        text.encode(stream.encoding or "ascii")
+        text.encode(stream.encoding or "utf-8")
     except UnicodeEncodeError:
         from selfcal_ros.outputs import spelled_out  # slow: numpy
 
