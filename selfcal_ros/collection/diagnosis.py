@@ -44,6 +44,10 @@ PLACED = (
 )
 """Reasons possibly caused by a stage away from all marks."""
 
+UNSTAMPED = (
+    "stamped 0: fill in header.stamp, with the instant of the exposure or reading; a node with "
+    "use_sim_time that hears no /clock stamps 0 too"
+)
 Span = tuple[int, int] | None
 NEARLY_ALL = 0.9
 """Fraction of the marks at whose sites the stage stands if their stamps alone are wrong."""
@@ -147,9 +151,24 @@ def diagnose(evidence: Evidence) -> RejectionFinding | None:
     reason, count, total = main
     cause = None
     if reason == Reason.NO_ENCODER:
-        cause = _joints(evidence) or _clock(evidence) or _rate(evidence)
+        cause = (
+            _joints(evidence)
+            or _unstamped(
+                {
+                    "detections": evidence.detections_ns,
+                    "encoder samples": evidence.encoder_ns,
+                }
+            )
+            or _clock(evidence)
+            or _rate(evidence)
+        )
     elif reason == Reason.OUTSIDE_VIEWS:
-        cause = _command_clock(evidence)
+        cause = _unstamped(
+            {
+                "detections": evidence.detections_ns,
+                "view commands": evidence.commands_ns,
+            }
+        ) or _command_clock(evidence)
     elif reason in PLACED:
         cause = _stage(evidence)
     return RejectionFinding(reason, count, total, cause or REMEDY[Reason(reason)])
@@ -170,6 +189,12 @@ def _joints(e: Evidence) -> str | None:
         f"no encoder sample of the joint {missing} arrived; joints received: {received}; set "
         "joint_x, joint_y, joint_theta"
     )
+
+
+def _unstamped(span_of_message: Mapping[str, Span]) -> str | None:
+    """Return which messages are all stamped 0; None if none are."""
+    names = [name for name, span in span_of_message.items() if span == (0, 0)]
+    return f"the {' and the '.join(names)} are {UNSTAMPED}" if names else None
 
 
 def _clock(e: Evidence) -> str | None:

@@ -490,6 +490,32 @@ def test_what_is_no_fault_does_not_count():
     assert diagnose(Evidence(rejected, 6)) is None
 
 
+@pytest.mark.parametrize(
+    ("reason", "name", "said"),
+    [
+        (
+            "outside_every_view",
+            "detections_ns",
+            "the detections are stamped 0: fill in",
+        ),
+        (
+            "outside_every_view",
+            "commands_ns",
+            "the view commands are stamped 0: fill in",
+        ),
+        ("no_encoder_sample_near", "encoder_ns", "the encoder samples are stamped 0"),
+    ],
+)
+def test_stamps_that_nobody_filled_in_are_not_asked_to_be_synchronised(
+    reason, name, said
+):
+    spans = dict.fromkeys(
+        ("detections_ns", "commands_ns", "encoder_ns"), (10**18, 10**18)
+    )
+    told = diagnose(Evidence({reason: 9}, 1, **(spans | {name: (0, 0)})))
+    assert told.text.startswith(said)
+
+
 @pytest.mark.parametrize("reason", list(REMEDY))
 def test_every_reason_has_its_remedy_without_further_evidence(reason):
     finding = diagnose(Evidence({str(reason): 9}, 1))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.clock_steps import ClockStep, StepWatch
+from selfcal_ros.collection.diagnosis import UNSTAMPED
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level
@@ -45,6 +46,7 @@ class ClockWatch:
         self._limit_s, self._limit_ns = limit_s, round(limit_s * NS_PER_S)
         self._live, self._live_run = False, ""
         self._bins: deque[tuple[float, int]] = deque()
+        self._unstamped: set[str] = set()  # topics whose newest messages are stamped 0
         self._watches: dict[str, StepWatch] = {}
         self.steps: dict[str, list[ClockStep]] = {}
 
@@ -76,6 +78,10 @@ class ClockWatch:
         steady_ns: np.ndarray,
     ) -> None:
         """Take the stamps and the reception, by both clocks, of messages of the cell; n > 0."""
+        self._unstamped.discard(topic)
+        if not stamps_ns.any():
+            self._unstamped.add(topic)
+            return
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
             self.steps.setdefault(topic, []).extend(watch.add(stamps_ns, steady_ns))
@@ -106,7 +112,11 @@ class ClockWatch:
         return self.offset_ns is not None and self.offset_ns > self._limit_ns
 
     def diagnosis(self) -> Diagnosis:
-        """Return WARN with the offset if beyond the limit."""
+        """Return WARN with the offset if beyond the limit, or without stamps."""
+        if self._live and self._unstamped:
+            return Diagnosis(
+                Level.WARN, f"{', '.join(sorted(self._unstamped))}: {UNSTAMPED}"
+            )
         offset = self.offset_ns
         if offset is None:
             return Diagnosis(Level.OK, "")

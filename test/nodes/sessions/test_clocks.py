@@ -78,6 +78,24 @@ def test_an_offset_is_named_beyond_its_limit_in_either_direction(offset_s, messa
     assert watch.ahead == (offset_s > 0.05)
 
 
+@pytest.mark.parametrize("topic", [DETECTION_TOPIC, ENCODER_TOPIC])
+def test_stamps_that_nobody_filled_in_are_no_clock_that_is_behind(topic):
+    watch = ClockWatch(limit_s=0.1)
+    watch.command(T0, T0, is_older=False)
+    for number in range(100):
+        stamp_ns = 0 if number >= 50 else T0 + number * 10**7
+        received = T0 + number * 10**7, 50 * 10**9 + number * 10**7
+        watch.data(topic, np.array([stamp_ns]), *np.array([received]).T)
+    assert watch.steps == {topic: []}
+    found = watch.diagnosis()
+    assert found.level == Level.WARN
+    assert found.message.startswith(f"{topic}: stamped 0: fill in header.stamp")
+    watch.data(
+        topic, np.array([T0 + 10**9]), np.array([T0 + 10**9]), np.array([10**11])
+    )
+    assert watch.diagnosis().message == ""
+
+
 @pytest.mark.parametrize("lead_s, offset_s", [(-0.645, None), (0.645, 0.645)])
 def test_a_slow_image_is_no_clock_that_is_behind(lead_s, offset_s):
     watch, now = ClockWatch(limit_s=0.1), [T0]
