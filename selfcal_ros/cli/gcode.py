@@ -16,6 +16,7 @@ from selfcal_ros.applications.controllers.gcode import (
 )
 from selfcal_ros.applications.controllers.gcode_codes import DIALECTS
 from selfcal_ros.applications.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
+from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
@@ -104,8 +105,9 @@ def run(args: argparse.Namespace) -> int:
     frame = replace(frame_of(args), unit="m")
     check_outputs([args.program, args.result], [file_of(args)])
     result, filled = ready(args)
+    method = "bilinear" if filled else StageMap(result).method
     rewriter = Rewriter(
-        wanted(result.error_map, Wiring(frame)),
+        wanted(result.error_map, Wiring(frame), method=method),
         dialect=args.dialect,
         tolerance_m=args.tolerance * M_PER_UM,
         step_m=step_of(result.error_map, args.tolerance * M_PER_UM),

@@ -13,8 +13,8 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.compensation.compensator import Compensator
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.result import ArtifactMap, result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import write_json
 from test.support.maps import random_map, result_of
@@ -128,6 +128,28 @@ def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(
         across = (way - np.multiply(begin, 1e-3)) @ [-along[1], along[0]]
         worst = max(worst, np.abs(across).max())
     assert 0.5e-6 * um < worst < 1.02e-6 * um
+
+
+@pytest.mark.parametrize("unknown", [False, True])
+def test_between_the_nodes_of_a_spline_the_path_is_that_of_the_spline(unknown, capsys):
+    """As `apply` and the compensator use it, linearly where a node was filled."""
+    emap = MAP
+    if unknown:
+        gx, gy = MAP.gx.copy(), MAP.gy.copy()
+        gx[0, 0] = gy[0, 0] = np.nan
+        emap = replace(MAP, gx=gx, gy=gy)
+    plate = Artifact(7, 0.01, map_grid=MapGrid(5, 0.01))
+    marks = ArtifactMap(np.zeros((7, 7)), np.zeros((7, 7)), np.zeros(0))
+    result = replace(result_of(emap), placed_plate=plate, artifact_map=marks)
+    write_json("R.json", result_to_dict(result))
+    Path("in.nc").write_text(f"{SAID}G0 X5 Y-3\n")
+    assert run(f"in.nc R.json -o - --decimals 7{' --fill' * unknown}") == 0
+    found = re.findall(r"X(\S+) Y(\S+)", capsys.readouterr().out)[-1]
+    ways = [Compensator(MAP, method=way) for way in ("bicubic", "bilinear")]
+    spline, linear = (1e3 * np.array(way.command(0.005, -0.003)) for way in ways)
+    assert np.abs(spline - linear).max() > 5e-6
+    expected = linear if unknown else spline
+    assert list(map(float, found)) == pytest.approx(expected, abs=2e-7)
 
 
 def test_not_qualified_is_code_5(capsys):

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from selfcal_ros.compensation.cells import Interpolation
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import Correction, require_known
@@ -99,8 +100,12 @@ class Grid:
         return below, below + 1, way - below
 
 
-def wanted(error_map: ErrorMap, wiring: Wiring) -> Correction:
+def wanted(
+    error_map: ErrorMap, wiring: Wiring, *, method: Interpolation = "bilinear"
+) -> Correction:
     """Return the correction c = +G at any position, in the controller's coordinates.
+
+    By `method` between the nodes: a table is linear there.
 
     Raises
     ------
@@ -108,7 +113,7 @@ def wanted(error_map: ErrorMap, wiring: Wiring) -> Correction:
         If a site is unknown: a table has no holes.
     """
     require_known(error_map)
-    stage = Compensator(error_map)
+    stage = Compensator(error_map, method=method)
     frame = wiring.frame
     sense = (-1.0 if wiring.negate else 1.0) / frame.unit_m
 
