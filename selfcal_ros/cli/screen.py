@@ -158,7 +158,7 @@ def what_now(picture: dict[str, Any]) -> str:
         "DONE",
         "ABORTED",
     ):
-        return f"Nothing: {health['message']}."
+        return f"Nothing to do: {health['message']}."
     look = f"Look: {health['message']}." if health["level"] else ""
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
@@ -173,12 +173,12 @@ def what_now(picture: dict[str, Any]) -> str:
         name = command.get("view_name") or health["values"].get("view_name", "")
         return f"Place the plate for view '{name}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
-        return look or "Nothing: the view is being measured."
+        return look or "Nothing to do: the view is being measured."
     return {
         "IDLE": "Press s to start the plan.",
         "DONE": "Done. s starts another run.",
         "ABORTED": "Aborted. s starts a new run.",
-        "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
+        "FOLLOWING": "Nothing to do: another sequencer is in command; a ends that.",
     }.get(state, health["message"])
 
 
@@ -288,7 +288,7 @@ def _coverage(view: dict[str, Any], width: int) -> list[Text]:
     counted = [
         ("marks", *view["grid"]),
         ("lines", *view["angular"]),
-        ("check stops of marks", *view["checks"]),
+        ("marks with check stops", *view["checks"]),
     ]
     share = min(
         1.0,

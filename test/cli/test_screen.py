@@ -56,14 +56,14 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
         (told("IDLE"), "Press s to start the plan."),
         (
             told("IDLE", "waiting for solver (no sign of life)", 1),
-            "Nothing: waiting for solver (no sign of life).",
+            "Nothing to do: waiting for solver (no sign of life).",
         ),
         (
             told("PLACING", view_name="rot90"),
             f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 "
             "mm; then press c.",
         ),
-        (told("MEASURING"), "Nothing: the view is being measured."),
+        (told("MEASURING"), "Nothing to do: the view is being measured."),
         (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
         (
             told("PLACING", "no sign of life from solver", 1),
@@ -72,7 +72,10 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
         ),
         (told("DONE"), "Done. s starts another run."),
         (told("ABORTED"), "Aborted. s starts a new run."),
-        (told("FOLLOWING"), "Nothing: another sequencer is in command; a ends that."),
+        (
+            told("FOLLOWING"),
+            "Nothing to do: another sequencer is in command; a ends that.",
+        ),
     ],
 )
 def test_what_a_person_has_to_do(sequencer, sentence):
@@ -90,7 +93,7 @@ def test_what_a_person_has_to_do(sequencer, sentence):
             f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 mm; then "
             "press c.",
         ),
-        ("MEASURE", "Nothing: the view is being measured."),
+        ("MEASURE", "Nothing to do: the view is being measured."),
         ("DONE", "Done. s starts another run."),
         ("ABORT", "Aborted. s starts a new run."),
     ],
@@ -164,7 +167,7 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
         "view 2 of 4: rot90",
         "plan hu, run 17",
         "marks 7 of 9, lines 3 of 8",
-        "check stops of marks 2 of 5",
+        "marks with check stops 2 of 5",
         "repeatability 0.0213 µm, -",
         "o o .",
         "missing lines 0, 2, 4, 5, 7",
@@ -275,7 +278,7 @@ def test_all_of_a_good_view_is_on_the_screen(size):
     assert len(rows) == size[1]
     for words in (
         "view 2 of 4: rot90 plan hu, run 17",
-        "Nothing: the view is being measured.",
+        "Nothing to do: the view is being measured.",
         "The map is saved as /results/hu_17.json",
         "marks 430 of 441, lines 3 of 8",
         "repeatability 0.0213 µm, 0.5 arcsec",
@@ -324,7 +327,7 @@ def test_what_there_is_no_room_for_is_counted(size):
 
 def test_a_small_terminal_says_what_is_to_be_done_and_asks_for_more_room():
     text = " ".join(shown(MEASURED, LOG, (59, 18)).split())
-    assert "Nothing: the view is being measured." in text
+    assert "Nothing to do: the view is being measured." in text
     assert "Make this terminal larger: 60 x 18." in text
 
 

@@ -90,7 +90,9 @@ def desk(graph, tmp_path):
 
 
 def test_a_plan_runs_from_start_to_done(desk):
-    assert desk.ask("start").message == "waiting for the plate to be placed: view 0"
+    count, first = len(PLAN.views), PLAN.views[0].name
+    said = f"waiting for the plate to be placed: view 1 of {count} '{first}'"
+    assert desk.ask("start").message == said
     expected = []
     for index in range(len(PLAN.views)):
         expected.append((PLACE, index))
@@ -132,8 +134,9 @@ def test_redo_skip_and_abort(desk):
     desk.ask("start")
     desk.ask("confirm_view")
     assert desk.ask("redo_view").success
-    assert desk.ask("skip_view").message.endswith("view 1")
-    assert desk.ask("abort").message == "aborted: view 1"
+    second = f"view 2 of {len(PLAN.views)} '{PLAN.views[1].name}'"
+    assert desk.ask("skip_view").message.endswith(second)
+    assert desk.ask("abort").message == f"aborted: {second}"
     desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 0), (PLACE, 1), (ABORT, 1))
     assert desk.ask("start").success
 
@@ -213,7 +216,7 @@ def test_the_run_of_another_sequencer_wins_over_its_own(desk):
         assert "following recorded commands" in answer.message
     desk.complete(0)
     assert len(desk.commands) == 5
-    assert desk.ask("abort").message.startswith("idle: view 0; what it followed is")
+    assert desk.ask("abort").message.startswith("idle; what it followed is")
     assert desk.ask("start").success
     desk.graph.until(lambda: len(desk.heard) == 6, "a command of its own")
 

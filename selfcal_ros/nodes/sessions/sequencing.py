@@ -165,7 +165,12 @@ class SequencingSession:
     def act(self, request: Callable[[], list[Command]]) -> str:
         """Pass a request to the state machine and report the result."""
         self._send(request())
-        return f"{self.machine.state}: view {self.machine.index}"
+        plan, state, index = self.machine.plan, self.machine.state, self.machine.index
+        if plan is None or state is State.IDLE or index >= len(plan.views):
+            return str(state)
+        return (
+            f"{state}: view {index + 1} of {len(plan.views)} '{plan.views[index].name}'"
+        )
 
     def give_up(self) -> str:
         """Abort the running plan, or stop waiting for missing nodes."""
