@@ -203,9 +203,12 @@ LASER_OFF_RAD = 1e-4
 def _set_up(result: StepDiagonalResult) -> list[str]:
     """Return what u leaves out: the mirror's angle, by formulation."""
     x, y = (result.n_blocks * step for step in result.steps_m[:2])
+    diagonal = result.n_blocks * float(np.linalg.norm(result.steps_m))
     if result.method == Method.CONVENTIONAL:
+        square_m = 1e-3**2 / 2 * diagonal**2 / (2 * x)
         wrong = (
-            f"1 mrad on one diagonal adds {1e-3 * y / 2 * UM_PER_M:.3g} µm to Px(x)"
+            f"1 mrad on one diagonal adds {1e-3 * y / 2 * UM_PER_M:.3g} µm to Px(x) and "
+            f"{square_m * UM_PER_M:.2g} µm to the squareness, whose u does not contain it"
             if result.dim == 2
             else "squareness as well"
         )
@@ -216,7 +219,6 @@ def _set_up(result: StepDiagonalResult) -> list[str]:
     angles = np.array(list(result.mirror_rad.values()))
     if not angles.size or result.covariance is None:
         return []
-    diagonal = result.n_blocks * float(np.linalg.norm(result.steps_m))
     share = diagonal**2 / (x * len(angles))
     off_m = LASER_OFF_RAD * float(np.linalg.norm(angles)) * share
     u_m = profiles.squareness(result).u

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What u of the step diagonals owes to whole runs, and what is said where it cannot hold."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from selfcal_ros.applications.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.applications.laser.noise import reading_noise
@@ -77,6 +79,22 @@ def test_linear_errors_of_nominal_directions_have_no_u():
     assert u_profile_m(found, 0, 0) is None and u_profile_m(found, 0, 1) is not None
     assert abs(result["profiles"]["px_x"]["error"][-1]) > 0.025
     assert "1 mrad on one diagonal adds 30 µm to Px(x)" in result["warnings"][-1]
+
+
+@pytest.mark.parametrize("steps", [(0.01, 0.01), (0.01, 0.008)])
+@pytest.mark.parametrize("sense", [1, -1])
+def test_what_a_mirror_makes_of_the_squareness_of_nominal_directions_is_said(
+    steps, sense
+):
+    """Half the square of its angle, of which u of the squareness knows nothing."""
+    exact = [
+        planar(steps, np.zeros((2, 6, 2)), mirror_rad=(sense * 1e-3 * off, 0.0))
+        for off in (0, 1)
+    ]
+    straight, tilted = (squareness(identify_wang(data)).value for data in exact)
+    said = outcome(identify_wang(exact[1]), exact[1])["warnings"][-1]
+    size_um = float(re.search(r"and (\S+) µm to the squareness", said)[1])
+    assert size_um == pytest.approx(1e6 * abs(tilted - straight), rel=0.03)
 
 
 def test_identical_repeats_show_no_uncertainty_although_their_mean_is_rounded():
