@@ -184,10 +184,11 @@ def read_points(text: str, where: str) -> np.ndarray:
         except ValueError:
             points[index] = np.nan
         if not np.abs(points[index]).max() < 1e12:
+            hint = "with decimal points, " * (len(cells) == 2 * len(head))
             raise InputError(
                 f"{where}:{number}",
-                f"not {len(head)} positions",
-                f"give {','.join(head)} in m and rad",
+                f"not {len(head)} positions: '{','.join(cells):.60}'",
+                f"give {','.join(head)} {hint}in m and rad",
             )
     if not len(points):
         raise InputError(where, "it has no points", "give at least one")

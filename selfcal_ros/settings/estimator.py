@@ -116,6 +116,11 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
             f"no column {', '.join(missing)}",
             "begin with the line id,x,y (x and y in m)",
         )
+    twice = [name for name in ("id", "x", "y") if head.count(name) > 1]
+    if twice:
+        raise InputError(
+            f"{where}:1", f"two columns {twice[0]}", "leave the right one of them"
+        )
     columns: dict[str, list[Any]] = {"id": [], "x": [], "y": []}
     for place, line in lines[1:]:
         cells = csv_cells(line, place)

@@ -157,7 +157,11 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
         ("", "p.csv:1: the header is not x,y or x,y,theta"),
         ("a,b\n1,2\n", "p.csv:1: the header is not x,y or x,y,theta"),
         ("x,y\n", "p.csv: it has no points"),
-        ("x,y\n1,2,3\n", "p.csv:2: not 2 positions; give x,y in m and rad"),
+        ("x,y\n1,2,3\n", "p.csv:2: not 2 positions: '1,2,3'; give x,y in m and rad"),
+        (
+            "x,y\n0,01,0,02\n",
+            "p.csv:2: not 2 positions: '0,01,0,02'; give x,y with decimal points, in",
+        ),
         ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"),
         ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
         ("x,y\n1,z\n", "p.csv:2: not 2 positions"),

@@ -70,6 +70,7 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
             r"marks.csv:1: no column y; begin with the line id,x,y \(x and y in m\)",
         ),
         ("", r"marks.csv:1: no column id, x, y"),
+        ("id,x,y,Y_m\n", r"marks.csv:1: two columns y; leave the right one of them"),
         (GOOD + "6,0.01\n", r"marks.csv:7: 2 cells, not 3; correct the line"),
         (GOOD + "6,a,0\n", r"marks.csv:7: x 'a' is not a number"),
         (GOOD + "6,0.0_1,0\n", r"marks.csv:7: x '0.0_1' is not a number"),
