@@ -39,6 +39,17 @@ def significant(value: float, digits: int = 3) -> str:
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
 
+def with_u(value: float, u: float) -> str:
+    """Return a value ± its uncertainty, this with two digits, and both with its decimals.
+
+    Without a finite uncertainty it is the value alone.
+    """
+    if not math.isfinite(u):
+        return significant(value)
+    decimals = decimals_for([u], 2) if u > 0 else 3
+    return f"{value:.{decimals}f} ± {u:.{decimals}f}"
+
+
 def um(value_m: float) -> str:
     """Return a length in µm with its unit, or ``not known``."""
     return (
@@ -424,7 +435,7 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     cells = camera.known_cells
 
     def value_text(value: float, u: float, scale: float, unit: str) -> str:
-        return f"{significant(value * scale)} ± {significant(u * scale)} {unit} (k=1)"
+        return f"{with_u(value * scale, u * scale)} {unit} (k=1)"
 
     worst = int(np.argmax(np.hypot(*cells[2:4])))
     x, y = cells[:2, worst] * MM_PER_M
@@ -453,7 +464,7 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
         ("distortion", " and ".join(distortions) or "none shown"),
         (
             "largest error",
-            f"{significant(size * UM_PER_M)} ± {significant(u * UM_PER_M)} µm at "
+            f"{with_u(size * UM_PER_M, u * UM_PER_M)} µm at "
             f"x {x:.4g} mm, y {y:.4g} mm of the image",
         ),
         (

@@ -36,6 +36,7 @@ from selfcal_ros.reporting.summary.numbers import (
     significant,
     truth_figures,
     um,
+    with_u,
 )
 from selfcal_ros.reporting.words.findings import assumption_text
 from selfcal_ros.reporting.words.phrases import counted_views, dof_text, of_few_read
@@ -200,12 +201,12 @@ def measurement_section(result: CalibrationResult) -> Section:
         value, u = (
             x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification)
         )
-        spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
+        k = " (k=1)" if math.isfinite(u) else ""
         facts.append(
             (
                 "magnification",
                 f"encoders indicate the plate {'larger' if value >= 0 else 'smaller'} than "
-                f"nominal by {significant(abs(value))}{spread} µm/m",
+                f"nominal by {with_u(abs(value), u)}{k} µm/m",
             )
         )
     if result.input.get("file"):
@@ -366,9 +367,9 @@ def _slope_text(
     """Return a slope, with its standard uncertainty, and what it means."""
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
     value, u = slope_and_u
-    spread = f" ± {u * UM_PER_M:.3g} (k=1)" if math.isfinite(u) else ""
+    k = " (k=1)" if math.isfinite(u) else ""
     return (
-        f"{symbol} {significant(value * UM_PER_M)}{spread} {unit} = {um(value * length)} over "
+        f"{symbol} {with_u(value * UM_PER_M, u * UM_PER_M)}{k} {unit} = {um(value * length)} over "
         f"{length * MM_PER_M:.6g} mm; {meaning} = {significant(2 * abs(value) * UM_PER_M)} "
         f"{unit}"
     )

@@ -56,7 +56,7 @@ from selfcal_ros.model.findings import (
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.reporting.summary.numbers import counted, p_text
+from selfcal_ros.reporting.summary.numbers import counted, p_text, with_u
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -98,10 +98,7 @@ def plus_minus(finding: Found, unit: DisplayUnit, times: float = 1.0) -> str:
     value, u = (
         times * unit.per_si * size_si for size_si in (abs(finding.size), finding.u)
     )
-    digits = 3
-    if math.isfinite(u) and u > 0:
-        digits = min(max(1 - math.floor(math.log10(u)), 0), 9)
-    return f"{value:.{digits}f} ± {u:.{digits}f} {unit.name}"
+    return f"{with_u(value, u)} {unit.name}"
 
 
 def _either(finding: Found, positive: str, negative: str) -> str:

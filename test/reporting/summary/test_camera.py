@@ -63,7 +63,7 @@ def test_the_summary_states_the_camera():
     assert facts["distortion"] == "radial (cubic)"
     worst = max(result().camera.cells, key=lambda c: np.hypot(c.dx, c.dy))
     assert facts["largest error"].startswith(
-        f"{significant(1e6 * np.hypot(worst.dx, worst.dy))} ± "
+        f"{1e6 * np.hypot(worst.dx, worst.dy):.4f} ± 0.00"
     )
     assert facts["largest error"].endswith(
         f" at x {worst.x * 1e3:.4g} mm, y {worst.y * 1e3:.4g} mm of the image"

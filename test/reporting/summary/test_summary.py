@@ -280,12 +280,13 @@ def test_orthogonality_and_scale_keep_their_signs_and_lengths():
     result, _ = known_result(11, 0)
     emap = replace(result.error_map, nonorthogonality=2e-6, scale_difference=-3e-6)
     text = summary_text(replace(result, error_map=emap))
-    u_o, u_r = (f"{1e6 * u:.3g}" for u in first_order_u(result))
+    u_o, u_r = (f"{1e6 * u:.3f}" for u in first_order_u(result))
+    assert all(0.01 <= float(u) < 0.1 for u in (u_o, u_r))  # two digits, three decimals
     assert (
-        f"O 2.00 ± {u_o} (k=1) µrad = 0.200 µm over 100 mm; out of square by 2|O| = 4.00 µrad"
+        f"O 2.000 ± {u_o} (k=1) µrad = 0.200 µm over 100 mm; out of square by 2|O| = 4.00 µrad"
     ) in text
     assert (
-        f"R -3.00 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; X and Y differ by 2|R| = 6.00"
+        f"R -3.000 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; X and Y differ by 2|R| = 6.00"
     ) in text
     damaged = replace(
         result, views=(replace(result.views[0], read_grid="x"), *result.views[1:])
