@@ -76,7 +76,7 @@ KINDS: tuple[type[Details], ...] = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BudgetLine:
     """A line of the uncertainty budget of a map (GUM), SI units.
 
@@ -106,12 +106,12 @@ class BudgetLine:
     quantity: str
     component: str
     kind: str
-    value: float
-    u: float
+    value: float = 0.0
+    u: float = 0.0
     unit: str
-    effect_rms: float
-    effect_max: float
-    dof: float
+    effect_rms: float = 0.0
+    effect_max: float = 0.0
+    dof: float = math.inf
     source: str
     details: Details | dict[str, Any] = field(default_factory=dict)
     text: str = ""

@@ -1080,7 +1080,6 @@ def _budget(
                     quantity=kind,
                     component=component,
                     kind=letter,
-                    value=0.0,
                     u=size,
                     unit=KINDS[kind],
                     effect_rms=rms(u),

@@ -511,7 +511,6 @@ def _line(
         unit=unit,
         effect_rms=float(np.sqrt(variance.mean())),
         effect_max=float(np.sqrt(variance.max())),
-        dof=np.inf,
         source=source,
     )
 

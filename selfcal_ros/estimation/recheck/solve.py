@@ -860,7 +860,6 @@ def _budget(
             quantity="xy",
             component=name,
             kind=kind,
-            value=0.0,
             u=u,
             unit=unit,
             effect_rms=rms(u_map),

@@ -398,12 +398,7 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
             quantity=kind,
             component="reading noise",
             kind="A",
-            value=0.0,
-            u=0.0,
             unit=unit,
-            effect_rms=0.0,
-            effect_max=0.0,
-            dof=np.inf,
             source="readings",
         )
     dof = _dof(noise, kind)
@@ -420,7 +415,6 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
         quantity=kind,
         component="reading noise",
         kind="B" if by == "declared" else "A",
-        value=0.0,
         u=sigma,
         unit=unit,
         effect_rms=rms(u),
@@ -455,7 +449,6 @@ def _term_line(
                 unit=block.unit,
                 effect_rms=effect_rms,
                 effect_max=effect_max,
-                dof=np.inf,
                 source="default",
                 details=OfAssumption(block.nominal),
             )
@@ -473,7 +466,6 @@ def _term_line(
             unit=unit,
             effect_rms=effect_rms,
             effect_max=effect_max,
-            dof=np.inf,
             source="readings",
             details=OfCause(name),
         )
@@ -514,12 +506,7 @@ def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetL
             quantity="xy",
             component="reference length",
             kind="B",
-            value=0.0,
-            u=0.0,
             unit="m/m",
-            effect_rms=0.0,
-            effect_max=0.0,
-            dof=np.inf,
             source="default",
         )
     return BudgetLine(
@@ -531,7 +518,6 @@ def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetL
         unit="m/m",
         effect_rms=rms(u),
         effect_max=float(u.max()),
-        dof=np.inf,
         source="declared",
         details=OfReference(str(reference.kind)),
     )
@@ -578,11 +564,9 @@ def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:
         quantity=quantity,
         component=INTERPOLATION,
         kind="B",
-        value=0.0,
         u=u,
         unit="m" if quantity == "xy" else "rad",
         effect_rms=u,
         effect_max=largest,
-        dof=np.inf,
         source="readings",
     )
