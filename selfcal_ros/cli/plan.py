@@ -284,10 +284,11 @@ def _check_json(
             }
         )
         if maps:
+            u_gx, u_gy = predicted.u_xy
             out["predicted"] |= plain(
                 {
-                    "u_gx": predicted.ux,
-                    "u_gy": predicted.uy,
+                    "u_gx": u_gx,
+                    "u_gy": u_gy,
                     "u_g_theta": predicted.u_theta,
                 }
             )
@@ -417,7 +418,7 @@ def _unchecked_text(observability: Observability) -> list[str]:
 
 def field_note(predicted: Prediction, plan: Plan) -> str:
     """Return a note if a prediction is not for the plan's own field, else an empty string."""
-    nx, ny = predicted.ux.shape
+    _, nx, ny = predicted.u_xy.shape
     return (
         ""
         if (nx, ny) == plan.artifact.field.shape
@@ -443,7 +444,8 @@ def _in_um(what: str, predicted: Prediction, plan: Plan, assumed: Assumed) -> st
 
 
 def _map_text(predicted: Prediction) -> list[str]:
-    u_xy = (predicted.ux**2 + predicted.uy**2) ** 0.5
+    u_x, u_y = predicted.u_xy
+    u_xy = (u_x**2 + u_y**2) ** 0.5
     return [
         "sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
         *(" ".join(f"{value:5.2f}" for value in row) for row in u_xy.T[::-1]),

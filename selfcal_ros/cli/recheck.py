@@ -96,7 +96,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
                 f"plate calibrated in {plan.artifact_from}",
                 *(
                     [
-                        f"{prediction.map.n_unknown} of {prediction.map.ux.size} nodes of the "
+                        f"{prediction.map.n_unknown} of {prediction.map.u_xy[0].size} nodes of the "
                         "map remain unknown"
                     ]
                     if prediction.map.n_unknown

@@ -198,7 +198,7 @@ def test_a_plan_is_judged_as_the_dense_solution():
     assert check_plan(plan).observability.identifiable
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     _, u = dense(readings(artifact, SIX, np.random.default_rng(0))[0])
-    assert np.stack([found.ux, found.uy]) == pytest.approx(u, rel=1e-5)
+    assert found.u_xy == pytest.approx(u, rel=1e-5)
 
 
 @pytest.mark.parametrize(("nodes", "gain"), [(5, 0.6798), (7, 0.8200)])
@@ -226,7 +226,7 @@ def test_three_nodes_a_side_are_determined_as_the_dense_solution_says(how, poses
     assert check_plan(plan).observability.identifiable
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     _, u = dense(readings(artifact, poses, np.random.default_rng(0))[0])
-    assert np.stack([found.ux, found.uy]) == pytest.approx(u, rel=1e-5)
+    assert found.u_xy == pytest.approx(u, rel=1e-5)
 
 
 @pytest.mark.parametrize(

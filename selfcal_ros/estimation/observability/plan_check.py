@@ -45,7 +45,7 @@ class Prediction:
 
     Attributes
     ----------
-    ux, uy : float array (nx, ny)
+    u_xy : float array (2, nx, ny)
         Of Gx and Gy, in units of the noise of a grid reading; their shape is that of the
         predicted field.
     u_theta : float array (K,)
@@ -53,24 +53,23 @@ class Prediction:
         views known; empty if no line is measured.
     """
 
-    ux: np.ndarray
-    uy: np.ndarray
+    u_xy: np.ndarray
     u_theta: np.ndarray
 
     @property
     def rms_xy(self) -> float:
         """Root mean square over all sites and both axes."""
-        return rms(np.stack([self.ux, self.uy]))
+        return rms(self.u_xy)
 
     @property
     def max_xy(self) -> float:
         """Largest value of a site on either axis."""
-        return float(np.nanmax(np.stack([self.ux, self.uy])))
+        return float(np.nanmax(self.u_xy))
 
     @property
     def n_unknown(self) -> int:
         """Number of sites that remain unknown."""
-        return int(np.isnan(self.ux).sum())
+        return int(np.isnan(self.u_xy[0]).sum())
 
     @property
     def rms_theta(self) -> float:
@@ -97,9 +96,9 @@ def predict(
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
-    ux, uy = np.sqrt(MapsCovariance(system, inverse).of_stage * repeats)
+    u_xy = np.sqrt(MapsCovariance(system, inverse).of_stage * repeats)
     if not system.angular.n_views:
-        return Prediction(ux, uy, np.zeros(0))
+        return Prediction(u_xy, np.zeros(0))
     conditions = conditions_for(
         system,
         ThetaDatum(datum),
@@ -107,7 +106,7 @@ def predict(
         artifact.grid_pitch_m * max(artifact.reach),
     )
     flat = replace(conditions, slopes=np.zeros_like(conditions.slopes))
-    return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(flat)[0]))
+    return Prediction(u_xy, np.sqrt(repeats * lines_alone(system).of_stage(flat)[0]))
 
 
 SEARCH_SIZE = 11

@@ -287,8 +287,8 @@ def with_part_of_terms(
     repeats : int
         Repeats of the averaged reading whose noise is the unit.
     """
-    (x, y), lines = terms.variances(terms.inverse(terms.noise_m) * repeats)
-    shape = without_terms.ux.shape
+    of_xy, lines = terms.variances(terms.inverse(terms.noise_m) * repeats)
+    u_xy = without_terms.u_xy
     u_theta = (
         np.sqrt(without_terms.u_theta**2 + terms.line_weight * lines)
         if (len(without_terms.u_theta))
@@ -296,8 +296,7 @@ def with_part_of_terms(
     )
     return replace(
         without_terms,
-        ux=np.sqrt(without_terms.ux**2 + x.reshape(shape)),
-        uy=np.sqrt(without_terms.uy**2 + y.reshape(shape)),
+        u_xy=np.sqrt(u_xy**2 + of_xy.reshape(u_xy.shape)),
         u_theta=u_theta,
     )
 
@@ -435,12 +434,7 @@ def _budget(
     lines = []
     for at, (quantity, sigma, unit, gains) in enumerate(
         (
-            (
-                "xy",
-                assumed.sigma_m,
-                "m",
-                np.stack([without_terms.ux, without_terms.uy]).reshape(2, -1),
-            ),
+            ("xy", assumed.sigma_m, "m", without_terms.u_xy.reshape(2, -1)),
             ("theta", assumed.sigma_rad, "rad", without_terms.u_theta),
         )
     ):

@@ -912,6 +912,6 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     emap = solved.error_map()
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
     return PlannedRecheck(
-        Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
+        Prediction(emap.u_xy / unit, u_theta),
         rms(map_change(solved.new, solved.artifact, plate).u) / unit,
     )

@@ -83,10 +83,10 @@ def test_prediction_is_the_uncertainty_that_the_solver_reports():
     result = calibrate(readings, BARE)
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     assert np.allclose(
-        result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4
+        result.error_map.u_gx / result.noise.sigma_xy, found.u_xy[0], rtol=1e-4
     )
     assert np.allclose(
-        result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4
+        result.error_map.u_gy / result.noise.sigma_xy, found.u_xy[1], rtol=1e-4
     )
     assert np.allclose(
         result.error_map.u_g_theta / result.noise.sigma_theta,
@@ -101,7 +101,7 @@ def test_equal_repeats_change_nothing_for_an_averaged_reading():
         predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES)
         for r in (1, 5)
     )
-    assert np.allclose(once.ux, five.ux, rtol=1e-12)
+    assert np.allclose(once.u_xy, five.u_xy, rtol=1e-12)
 
 
 def test_large_fields_are_predicted_on_a_smaller_one_and_say_so(monkeypatch):
@@ -110,7 +110,7 @@ def test_large_fields_are_predicted_on_a_smaller_one_and_say_so(monkeypatch):
     )
     monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.PROXY_SIZE", 9)
     found = predict_plan(plan_of("0, 90, tx", 21), ThetaDatum.XY_AXES)
-    assert found.ux.shape == (9, 9)
+    assert found.u_xy.shape == (2, 9, 9)
     assert found.rms_xy < 0.949
 
 

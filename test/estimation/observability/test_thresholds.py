@@ -86,7 +86,7 @@ def test_the_prediction_for_marks_counts_the_repeats_of_each_view():
             planned_system(plan.artifact, views), plan.artifact, ThetaDatum.ZERO_MEAN
         )
         assert found.u_theta.shape == (0,)  # a plate without lines
-        return found.ux[np.isfinite(found.ux)] ** 2
+        return found.u_xy[0][np.isfinite(found.u_xy[0])] ** 2
 
     once, twice, one_more = of(1, 1, 1), of(2, 2, 2), of(1, 1, 2)
     assert len(once) > 20 and twice == pytest.approx(once / 2, rel=1e-9)

@@ -236,7 +236,7 @@ def test_what_a_view_with_images_will_tell_is_predicted():
         np.stack([result.error_map.u_gx, result.error_map.u_gy])
         / plate.result.noise.sigma_xy
     )
-    np.testing.assert_allclose(np.stack([planned.map.ux, planned.map.uy]), u, rtol=1e-6)
+    np.testing.assert_allclose(planned.map.u_xy, u, rtol=1e-6)
     assert 0.9 < planned.map.rms_xy < 1.3
 
 
