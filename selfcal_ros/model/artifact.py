@@ -253,6 +253,11 @@ class Artifact:
         x, y = np.abs(self.marks.places_m).max(axis=1) / self.grid_pitch_m
         return float(x), float(y)
 
+    @property
+    def half_width_m(self) -> float:
+        """Longer half width of the plate, m."""
+        return self.grid_pitch_m * max(self.reach)
+
     @cached_property
     def m(self) -> np.ndarray:
         """Index m of every site, int array (nx, ny)."""

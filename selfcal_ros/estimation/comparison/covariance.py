@@ -370,8 +370,7 @@ class Together:
     @property
     def half_width_m(self) -> float:
         """The longer half width of the plate, m."""
-        plate = self.result.plate
-        return plate.grid_pitch_m * max(plate.reach)
+        return self.result.plate.half_width_m
 
     @cached_property
     def maps(self) -> MapsCovariance:

@@ -486,10 +486,7 @@ def prepare(
             "undetermined)",
             observability,
         )
-    half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    inputs = term_inputs(
-        measurements, grid, half_width_m, drift_degree=options.drift_degree
-    )
+    inputs = term_inputs(measurements, grid, drift_degree=options.drift_degree)
     # as a column, offsets would explain the noise that they hold
     inputs = replace(
         inputs, line_offsets=inputs.line_offsets - angular_residuals(system, angular.y)

@@ -103,7 +103,7 @@ def predict(
         system,
         ThetaDatum(datum),
         Sense.MICROSCOPE_MOVES,
-        artifact.grid_pitch_m * max(artifact.reach),
+        artifact.half_width_m,
     )
     flat = replace(conditions, slopes=np.zeros_like(conditions.slopes))
     return Prediction(u_xy, np.sqrt(repeats * lines_alone(system).of_stage(flat)[0]))

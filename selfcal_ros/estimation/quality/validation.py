@@ -107,7 +107,7 @@ def held_readings(
         problem.grid.index.index(i) if i in problem.grid.index else -1
         for i in grid.index
     )
-    inputs = term_inputs(held_out, grid, problem.half_width_m)
+    inputs = term_inputs(held_out, grid)
     places = places_of(held_out, grid, inputs, problem.system.known_sites)
     place_change: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
     if problem.moves and places is not None:

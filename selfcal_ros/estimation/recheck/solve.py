@@ -475,8 +475,7 @@ def _problem(
     system = system_of(
         replace(grid, known_plate=True), Marks((), angular.weight[:0], ())
     )
-    length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    inputs = term_inputs(measurements, grid, length, drift_degree=options.drift_degree)
+    inputs = term_inputs(measurements, grid, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in inputs.visits))
     return problem_of(
         measurements, options, system, inputs, readings=(grid, angular), terms=terms

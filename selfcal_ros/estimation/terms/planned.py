@@ -125,10 +125,7 @@ def planned_inputs(
         expected.append(view)
     readings = replace(planned, views=tuple(expected))
     return term_inputs(
-        readings,
-        grid_data(readings),
-        artifact.grid_pitch_m * max(artifact.reach),
-        drift_degree=assumed.drift_degree,
+        readings, grid_data(readings), drift_degree=assumed.drift_degree
     )
 
 

@@ -389,7 +389,6 @@ class TermInputs:
 def term_inputs(
     measurements: Measurements,
     grid: GridData,
-    half_width_m: float,
     *,
     drift_degree: int = DRIFT_DEGREE,
 ) -> TermInputs:
@@ -413,7 +412,7 @@ def term_inputs(
     )
     return TermInputs(
         z=z,
-        half_width_m=half_width_m,
+        half_width_m=measurements.artifact.half_width_m,
         weight=grid.weight,
         visits=visits,
         names=tuple(view.name for view in views),

@@ -189,7 +189,7 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
         measurements.artifact,
         [v.view for v in measurements.views],
         system,
-        inputs=term_inputs(measurements, grid, 1.0),
+        inputs=term_inputs(measurements, grid),
     )
     left = np.eye(len(matrix)) - matrix @ inverse
     together = np.kron(stops[:, None] == stops, np.eye(2))

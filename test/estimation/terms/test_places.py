@@ -57,7 +57,7 @@ def found_in(measurements, known=None):
     grid = grid_data(measurements)
     known = np.ones((N, N), dtype=bool) if known is None else known
     return places_of(
-        measurements, grid, term_inputs(measurements, grid, 3 * PITCH_M), known
+        measurements, grid, term_inputs(measurements, grid), known
     )
 
 

@@ -308,7 +308,7 @@ def test_no_columns_make_nothing_of_any_visit():
     readings = simulate_measurements(
         random_truth(plan.artifact, 1, rng), plan, rng, visits=True
     )
-    inputs = term_inputs(readings, grid_data(readings), 0.02)
+    inputs = term_inputs(readings, grid_data(readings))
     columns = term_columns(inputs, [ModelTerm("plate_scale")])
     assert columns.columns == () and columns.at_visits(np.zeros(0)) == [0.0]
     free = term_columns(replace(inputs, drift_degree=1), [ModelTerm("drift")])

@@ -25,7 +25,7 @@ def inputs():
         settings=CellSettings(),
         visits=True,
     )
-    return term_inputs(readings, grid_data(readings), 0.03)
+    return term_inputs(readings, grid_data(readings))
 
 
 @pytest.mark.parametrize("view", [0, 1])
