@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of two maps after removing the datum difference, with its significance."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
@@ -95,10 +95,6 @@ class ReducedNoise:
             return len(self._axes[0])
         return max(int(self.varies.sum()) - self.removed.shape[1], 1)
 
-    def squares(self, ratio: np.ndarray) -> np.ndarray:
-        """Return the squared Mahalanobis distances of values over `u`, (n, ...)."""
-        return (self.white(ratio) ** 2).sum(axis=0)
-
     def white(self, ratio: np.ndarray) -> np.ndarray:
         """Return values over `u`, (n, ...), along their axes, of variance 1, (r, ...)."""
         if not self.correlated:
@@ -149,7 +145,8 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
     ratio = values / spread.u
     varies = spread.varies
     rank = spread.rank
-    square = float(spread.squares(np.where(varies, ratio, 0.0)))
+    # the squared Mahalanobis distance
+    square = float((spread.white(np.where(varies, ratio, 0.0)) ** 2).sum())
     p = of_square(square, rank, dof)
     largest = float(abs(ratio[varies]).max())
     drawn = abs(spread.drawn[varies]).max(axis=0) if spread.correlated else None
@@ -291,7 +288,6 @@ def compare(
     InputError
         If the lattices differ or no site is known in both.
     """
-    covariance = partial(covariance_of, plate=plates)
     pair = [(plate_as_map(result) if plates else result).error_map for result in (a, b)]
     require_same_lattice(pair[0].artifact, pair[1].artifact, names)
     n_known = int((pair[0].valid & pair[1].valid).sum())
@@ -303,7 +299,7 @@ def compare(
         )
 
     xy, theta = (
-        _difference((a, b), pair, kind, covariance, scale=not keep_scale)
+        _difference((a, b), pair, kind, plates=plates, scale=not keep_scale)
         for kind in KINDS
     )
     o, r = (
@@ -339,8 +335,8 @@ def _difference(
     results: Sequence[CalibrationResult],
     maps: Sequence[ErrorMap],
     kind: str,
-    covariance: Callable[..., np.ndarray],
     *,
+    plates: bool,
     scale: bool,
 ) -> _Difference:
     """Return the second map minus the first."""
@@ -360,7 +356,12 @@ def _difference(
         return _Difference(out, datum, None)
 
     total = np.sum(
-        of_one_kind([covariance(result, kind, known_places) for result in results]),
+        of_one_kind(
+            [
+                covariance_of(result, kind, known_places, plate=plates)
+                for result in results
+            ]
+        ),
         axis=0,
     )
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]

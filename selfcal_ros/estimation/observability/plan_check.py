@@ -153,12 +153,7 @@ def check_plan(plan: Plan) -> PlanCheck:
     )
     if not observability.identifiable:
         return with_unseen_modes(observability, system, plan)
-    return PlanCheck(
-        observability,
-        unknown_sites=0
-        if plan.artifact.map_grid is None
-        else int((~system.known_sites).sum()),
-    )
+    return PlanCheck(observability, unknown_sites=int((~system.known_sites).sum()))
 
 
 def with_unseen_modes(

@@ -315,8 +315,6 @@ def check_terms(
 
 
 def _n_unseen(equations: TermEquations) -> int:
-    if not equations.n:
-        return 0
     return equations.unseen(np.ones(equations.n, dtype=bool)).shape[1]
 
 

@@ -261,13 +261,12 @@ def score_plan(
     The XY uncertainty includes the contribution of the terms of `against`.
     """
     system = planned_system(plan.artifact, plan.views)
-    unknown_sites = 0
-    if plan.artifact.map_grid is None:
-        unseen = deficiency(system)
-    else:
-        observability = full_observability(system, plan.artifact, plan.views)
-        unseen = 0 if observability.identifiable else max(observability.deficiency, 1)
-        unknown_sites = int((~system.known_sites).sum())
+    # on the lattice by itself: full observability seeks advice
+    unseen = (
+        deficiency(system)
+        if plan.artifact.map_grid is None
+        else full_observability(system, plan.artifact, plan.views).deficiency
+    )
     if unseen:
         return PlanScore(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
@@ -280,7 +279,11 @@ def score_plan(
         prediction = with_part_of_terms(prediction, terms, repeats)
     theta = prediction.rms_theta if len(prediction.u_theta) else 0.0
     return PlanScore(
-        0, prediction.rms_xy, prediction.max_xy, theta, unknown_sites=unknown_sites
+        0,
+        prediction.rms_xy,
+        prediction.max_xy,
+        theta,
+        unknown_sites=prediction.n_unknown,
     )
 
 

@@ -511,13 +511,11 @@ def _held_out(
         solved, predicted, predictable=predictable, error=error
     )
     return HeldOut(
-        view="",
-        tenth=0,
         n_grid=coordinates.shape[1],
         n_angular=len(lines_off),
-        rms_m=rms(coordinates) if coordinates.size else NOTHING,
+        rms_m=rms(coordinates),
         max_m=float(abs(coordinates).max()) if coordinates.size else NOTHING,
-        rms_rad=rms(lines_off) if lines_off.size else NOTHING,
+        rms_rad=rms(lines_off),
         ratio=ratio,
         why=why,
         limit=limit,
