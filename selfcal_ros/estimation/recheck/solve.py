@@ -554,8 +554,6 @@ def _readings(
     )
 
 
-WELL = 1 / 3
-"""Uncertainty in sizes of the assumption from which on visits show the microscope."""
 ANY = 1.0
 """Size of a scale and a turn of the microscope of which nothing is assumed."""
 
@@ -648,7 +646,7 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     coefficients[free[of_offsets]] = exact.real, exact.imag
     covariance = covariance[np.ix_(of_offsets, of_offsets)] / abs(1 - slope) ** 4
     u = np.sqrt(covariance.diagonal()[free[of_offsets]])
-    if (u > WELL * columns.size[free]).any():
+    if (BEYOND * u > columns.size[free]).any():
         return None
     return SeenMicroscope(coefficients, covariance, float(np.sqrt(variance)))
 

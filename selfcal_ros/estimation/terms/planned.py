@@ -124,9 +124,7 @@ def planned_inputs(
             view = replace(view, dtheta=of_lines[index] + lies[0])
         expected.append(view)
     readings = replace(planned, views=tuple(expected))
-    return term_inputs(
-        readings, grid_data(readings), drift_degree=assumed.drift_degree
-    )
+    return term_inputs(readings, grid_data(readings), drift_degree=assumed.drift_degree)
 
 
 def _placings(planned: Measurements) -> list[int]:

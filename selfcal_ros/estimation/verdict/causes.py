@@ -481,7 +481,7 @@ class Explanation:
     covariance: np.ndarray
     p: float
     determined: bool
-    effect_m: float
+    effect_m: float = 0.0
     share_before: float = float("nan")
     mark: tuple[int, int] | None = None
     map_change: np.ndarray | None = None
@@ -749,7 +749,6 @@ def _explanation(
         covariance=variance * fitted.inverse[np.ix_(of_group, of_group)],
         p=p,
         determined=pool.explain(group.rows).rank == int(group.rows.sum()),
-        effect_m=0.0,
         share_before=group.share_before,
         mark=group.mark,
     ).with_effect(pool.equations, coefficients)
@@ -818,7 +817,6 @@ def fitted_term(
         covariance=covariance,
         p=p,
         determined=determined,
-        effect_m=0.0,
     )
     return explanation.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 

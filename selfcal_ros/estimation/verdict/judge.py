@@ -44,6 +44,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
     Effect,
     budget_lines,
+    effect_everywhere,
     enlarged,
     enlargements,
     with_coverage,
@@ -236,23 +237,12 @@ def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
     emap = solved.result.error_map
     fitted = solved.model.fitted
     system = solved.model.problem.system
-    shape = emap.gx.shape
     size_m = _lack_of_fit(solved.xy, system.grid.weight, abs(fitted.residuals))
     if size_m:
-        sign = 1 - 2 * (np.indices(shape).sum(axis=0) % 2)
-        alternating_m = np.where(emap.valid, sign * size_m, 0.0)
-        yield Effect(
-            LACK_OF_FIT,
-            np.stack([alternating_m, alternating_m]),
-            np.zeros(len(emap.g_theta)),
-        )
+        yield effect_everywhere(LACK_OF_FIT, emap, size_m=size_m)
     size_rad = _lack_of_fit(solved.theta, system.angular.weight, fitted.residuals_theta)
     if size_rad:
-        yield Effect(
-            LACK_OF_FIT,
-            np.zeros((2, *shape)),
-            np.where(np.isfinite(emap.g_theta), size_rad, 0.0),
-        )
+        yield effect_everywhere(LACK_OF_FIT, emap, size_rad=size_rad)
 
 
 def _lack_of_fit(

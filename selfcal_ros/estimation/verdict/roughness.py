@@ -28,7 +28,7 @@ from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import FLOOR, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_residuals
-from selfcal_ros.estimation.verdict.uncertainty import Effect
+from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_everywhere
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.findings import Cause
 from selfcal_ros.model.kept import ROUGHNESS as NAME
@@ -70,21 +70,12 @@ class Adequacy:
         return len(self.nodes) == 1
 
     def effect(self, result: CalibrationResult) -> Effect:
-        """Return the lack of fit as an effect on every known node.
-
-        Its sign changes from node to node: the datum takes nothing of it out.
-        """
+        """Return the lack of fit as an effect on every known node, or line."""
         emap = result.error_map
         if self.of_lines:
-            return Effect(
-                NAME,
-                np.zeros((2, *emap.gx.shape)),
-                np.where(np.isfinite(emap.g_theta), self.lack, 0.0),
-            )
-        sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
+            return effect_everywhere(NAME, emap, size_rad=self.lack)
         local = turned_over(result.sense, self.local, sign=1)
-        node_lack_m = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
-        return Effect(NAME, node_lack_m, np.zeros(len(emap.g_theta)))
+        return effect_everywhere(NAME, emap, size_m=np.maximum(self.lack, local))
 
     @property
     def cause(self) -> Cause | None:

@@ -49,7 +49,7 @@ from selfcal_ros.model.findings import Cause, Remedy
 from selfcal_ros.model.kept import NOISE
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, merged
-from selfcal_ros.model.verdict import TermResult
+from selfcal_ros.model.verdict import Enlargement, TermResult
 
 ALWAYS_SITES = FULL_SIZE**2
 """Field up to which causes are always searched for; in a larger one only if a test fails."""
@@ -345,17 +345,14 @@ def _search(
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
     model = solved.joint
-    explanations = [
-        item
-        for item in find_explanations(model, slips=False)
-        if failed or _counts(item, solved)
-    ]
-    if explanations or failed:
+    for slips in (False, True):
         explanations = [
             item
-            for item in find_explanations(model, slips=True)
+            for item in find_explanations(model, slips=slips)
             if failed or _counts(item, solved)
         ]
+        if not (explanations or failed):
+            return []
     if not explanations or (fine := finer(model)) is None:
         return explanations
     names_in_finer_map = {item.name for item in find_explanations(fine, slips=True)}
@@ -444,10 +441,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
 
     A size that is not plausible is a fault, however little of it is seen in the map.
     """
-    term = next(term for term in solved.result.model.terms if term.name == test.name)
-    contributions = enlargements(solved.result, [term.name], [])
-    u = rms(solved.result.error_map.u_xy)
-    u_of_map = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
+    term, contributions, u_of_map = _effect_of(solved, test)
     # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(contributions) and all(
         contribution.u_rms < MATTERS * u_of_map[contribution.unit]
@@ -480,14 +474,25 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
 
 def _beyond_u(solved: Solved, test: SizeTest) -> bool:
     """Return whether a term is surely there, and what no reading determines of it exceeds u."""
-    term = next(term for term in solved.result.model.terms if term.name == test.name)
+    term, contributions, u_of_map = _effect_of(solved, test)
     if not test.p_together < BEYOND_DOUBT or test.rank == len(term.estimates):
         return False
-    emap = solved.result.error_map
-    u_of_map = {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)}
     return any(
         2 * contribution.u_rms**2 > u_of_map[contribution.unit] ** 2
-        for contribution in enlargements(solved.result, [term.name], [])
+        for contribution in contributions
+    )
+
+
+def _effect_of(
+    solved: Solved, test: SizeTest
+) -> tuple[TermResult, tuple[Enlargement, ...], dict[str, float]]:
+    """Return the term of a test, what it contributes to u, and u of each map, by its unit."""
+    term = next(term for term in solved.result.model.terms if term.name == test.name)
+    emap = solved.result.error_map
+    return (
+        term,
+        enlargements(solved.result, [term.name], []),
+        {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)},
     )
 
 

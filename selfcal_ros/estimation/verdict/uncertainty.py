@@ -25,7 +25,7 @@ from selfcal_ros.model.budget import (
     OfReference,
     OfTerm,
 )
-from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
+from selfcal_ros.model.error_map import CELL_MEAN, ErrorMap, error_halfway, rms
 from selfcal_ros.model.kept import NOISE, rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceLength
@@ -81,6 +81,25 @@ def effect_of_field(
     field = turned_over(sense, field)
     return Effect(
         name, np.stack([field.real, field.imag]), lines_turned_over(sense, theta)
+    )
+
+
+def effect_everywhere(
+    name: str,
+    emap: ErrorMap,
+    *,
+    size_m: float | np.ndarray = 0.0,
+    size_rad: float = 0.0,
+) -> Effect:
+    """Return an effect of a size on every known node and line.
+
+    Its sign changes from node to node: the datum takes nothing of it out.
+    """
+    sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
+    return Effect(
+        name,
+        np.where(emap.valid, sign * size_m, np.zeros((2, 1, 1))),
+        np.where(np.isfinite(emap.g_theta), size_rad, 0.0),
     )
 
 

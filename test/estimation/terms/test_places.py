@@ -56,9 +56,7 @@ def readings(stands_m, sense=Sense.MICROSCOPE_MOVES):
 def found_in(measurements, known=None):
     grid = grid_data(measurements)
     known = np.ones((N, N), dtype=bool) if known is None else known
-    return places_of(
-        measurements, grid, term_inputs(measurements, grid), known
-    )
+    return places_of(measurements, grid, term_inputs(measurements, grid), known)
 
 
 def stands(x, y):
