@@ -236,11 +236,7 @@ class MapsCovariance:
         g, a, _ = self._functionals(sites, marks)
         field, parameters, of_coefficients = self._solved(g, a)
         maps = (field - terms.fields @ of_coefficients).T.reshape(-1, *grid.views.shape)
-        y = (
-            np.tensordot(of_coefficients.T, terms.columns, axes=1)
-            if len(of_coefficients)
-            else np.zeros(1)
-        )
+        y = np.tensordot(of_coefficients.T, terms.columns, axes=1)
         residuals = grid.plate(
             -y, maps, (parameters - self._moved @ of_coefficients).T
         )[1]

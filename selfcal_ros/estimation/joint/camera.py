@@ -467,7 +467,7 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     name = next(
         (term.name for term in model.problem.terms if term.block.of_images), None
     )
-    if images is None or name is None or model.equations is None:
+    if images is None or name is None:
         return None
     free = replace(
         model.equations, columns=model.equations.columns.scaled(name, math.inf)

@@ -70,8 +70,8 @@ class ModelFit:
         As it was solved, with the noise that terms leave.
     fitted : JointFit
         Maps and misalignments, terms taken off.
-    equations : TermEquations or None
-        Equations of the terms; None without terms.
+    equations : TermEquations
+        Equations of the terms.
     coefficients : float array (p,)
         Of the terms' columns.
     y : complex array (views, nx, ny)
@@ -85,7 +85,7 @@ class ModelFit:
 
     problem: Problem
     fitted: JointFit
-    equations: TermEquations | None
+    equations: TermEquations
     coefficients: np.ndarray
     y: np.ndarray
     sizes: tuple[SizeTest, ...] = ()
@@ -94,8 +94,6 @@ class ModelFit:
     @property
     def covariance(self) -> np.ndarray:
         """Covariance of the coefficients for unit noise of one grid reading, (p, p)."""
-        if self.equations is None:
-            return np.zeros((0, 0))
         return self.equations.inverse(self.fitted.xy.sigma)
 
     def visits_about_means(self) -> Iterator[tuple[int, ViewVisits, np.ndarray]]:
@@ -103,25 +101,16 @@ class ModelFit:
 
         Complex (V,), plate frame, m, without the terms.
         """
-        of_terms = (
-            []
-            if self.equations is None
-            else self.equations.columns.at_visits(self.coefficients)
-        )
+        of_terms = self.equations.columns.at_visits(self.coefficients)
+        n_marks = self.problem.system.grid.n_marks
         for row, visits in enumerate(self.problem.inputs.visits):
             if visits is not None:
-                y = visits.y - (of_terms[row] if of_terms else 0.0)
-                yield (
-                    row,
-                    visits,
-                    visits.about_means(y[None], self.problem.system.grid.n_marks)[0],
-                )
+                y = visits.y - of_terms[row]
+                yield row, visits, visits.about_means(y[None], n_marks)[0]
 
     @property
-    def spread(self) -> TermSpread | None:
-        """What the terms' uncertainty does to the maps; None without terms."""
-        if self.equations is None:
-            return None
+    def spread(self) -> TermSpread:
+        """What the terms' uncertainty does to the maps."""
         now = equations_of(self.problem, self.fitted, self.equations.columns)
         return spread_of(now, now.inverse(self.fitted.xy.sigma))
 
@@ -145,7 +134,7 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
         columns=columns.grid,
         lines=on_lines,
         fields=fit.fields,
-        plates=np.array(plates).T,
+        plates=np.array(plates).reshape(-1, system.grid.n_marks).T,
         parameters=fit.parameters,
         turned=fit.turned,
         covariance=covariance,
@@ -155,8 +144,7 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
     """Return the solution with the sizes as they are; arguments as `finer.fit_model`."""
     state = _State(problem)
-    if state.equations is not None:
-        check(state.equations)
+    check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
     before = np.inf
@@ -227,30 +215,28 @@ class _State:
             np.zeros_like(self.y),
         )
         self.fell = self.rounds = False
-        self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
-        if problem.terms:
-            inputs = without_noise(problem.inputs, self.fitted.residuals)
-            self._linearise(term_columns(inputs, problem.terms))
-        equations = self.equations
-        self.coefficients = self.stepped = np.zeros(equations.n if equations else 0)
+        inputs = without_noise(problem.inputs, self.fitted.residuals)
+        self._linearise(term_columns(inputs, problem.terms))
+        self.coefficients = self.stepped = np.zeros(self.equations.n)
 
     def _linearise(self, columns: TermColumns) -> None:
         """Set up the equations of the terms about the present solution."""
         self.weights, self.ratio = self.fitted.inverse, self.fitted.ratio
         self.equations = equations_of(self.problem, self.fitted, columns)
 
-    def _refresh(self, equations: TermEquations) -> None:
+    def _refresh(self) -> None:
         """Set up the equations again where visits, offsets or weights have changed."""
         if 0 < self.steps <= self.offset_steps and (
             self.of_offsets or self.problem.moves
         ):
-            self._linearise(self._anew(equations.columns))
-        elif self._stale(equations):
-            self._linearise(equations.columns)
+            self._linearise(self._anew())
+        elif self._is_stale:
+            self._linearise(self.equations.columns)
 
-    def _anew(self, before: TermColumns) -> TermColumns:
+    def _anew(self) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
+        before = self.equations.columns
         inputs = without_noise(
             self.moving.inputs(self.fitted),
             self.fitted.residuals,
@@ -268,11 +254,12 @@ class _State:
             self.offset_steps = self.steps
         return columns
 
-    def _stale(self, equations: TermEquations) -> bool:
-        """Return whether the weights of angular readings differ from those in the equations."""
+    @property
+    def _is_stale(self) -> bool:
+        """Whether the weights of angular readings differ from those in the equations."""
         now = self.fitted.inverse
         then = self.weights
-        if len(equations.columns.lines.at) and (
+        if len(self.equations.columns.lines.at) and (
             abs(self.fitted.ratio - self.ratio) > NEGLIGIBLE * self.ratio
         ):
             return True
@@ -288,11 +275,11 @@ class _State:
         parameters = self.fitted.parameters
         y = self.y
         coefficients = self.coefficients
-        if self.equations is not None:
-            self._refresh(self.equations)
+        if self.problem.terms:
+            self._refresh()
         self.steps += 1
-        if self.equations is not None:
-            self._solve_terms(self.equations)
+        if self.problem.terms:
+            self._solve_terms()
         elif self.problem.moves:
             self.problem = replace(
                 self.problem, repeats_xy=self.moving.repeats(self.fitted)
@@ -340,20 +327,19 @@ class _State:
 
     def _terms_are_still(self, part_m: float) -> bool:
         """Return whether the last step of each coefficient was below a part of its noise."""
-        if self.equations is None:
-            return True
         variances = np.maximum(
             np.diag(self.equations.inverse(self.fitted.xy.sigma)), 0.0
         )
         return bool((np.abs(self.stepped) <= part_m * np.sqrt(variances)).all())
 
     def finished(self) -> ModelFit:
-        if self.equations is not None and self._stale(self.equations):
+        if self._is_stale:
             self._linearise(self.equations.columns)
         problem = replace(self.problem, inputs=self.moving.inputs(self.fitted))
         return ModelFit(problem, self.fitted, self.equations, self.coefficients, self.y)
 
-    def _solve_terms(self, equations: TermEquations) -> None:
+    def _solve_terms(self) -> None:
+        equations = self.equations
         now = score(
             equations,
             self.fitted.both_residuals,
@@ -416,13 +402,11 @@ class _State:
         self,
         trait: Callable[[Block], bool] = lambda block: True,
         by: np.ndarray | None = None,
-    ) -> np.ndarray | float:
+    ) -> np.ndarray:
         """Return the effect of the terms with a trait on the readings, (views, nx, ny), m.
 
         Of their coefficients, or of other ones.
         """
-        if self.equations is None:
-            return 0.0
         columns = self.equations.columns
         return columns.shapes.combined(
             self.coefficients if by is None else by, columns.having(trait)
@@ -615,7 +599,7 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
         conditions=replace(problem.conditions, slopes=flat),
     )
     refitted = replace(model, problem=problem, fitted=fit(problem, model.y))
-    if model.equations is None:
+    if not problem.terms:
         return refitted
     weighted = np.isfinite(refitted.fitted.xy.sigma)
     return _with_terms(refitted, model.equations.columns) if weighted else None
@@ -735,7 +719,7 @@ def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, 
 def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ...]:
     """Return the tests of the sizes of terms by one fit; none without a noise to test them by."""
     equations = model.equations
-    if equations is None or equations.free.all():
+    if equations.free.all():
         return ()
     scored = score(
         equations,

@@ -12,7 +12,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +51,6 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
-    TermEquations,
     require_terms_determined,
     roots_by_term,
 )
@@ -542,7 +541,7 @@ def _solved(
             problem.system,
             fitted.inverse,
             options.reference,
-            terms=model.spread,
+            terms=model.spread if problem.terms else None,
             half_width_m=problem.half_width_m,
             sigma_m=least,
         )
@@ -673,7 +672,7 @@ def _short(weight: float) -> float | int:
 
 def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult, ...]:
     """Return the estimates of each term of the model; those not `declared` are assumed."""
-    if model.equations is None:
+    if not model.problem.terms:
         return ()
     columns = model.equations.columns.columns
     covariance = model.covariance
@@ -745,7 +744,7 @@ def _error_map(
                         added=np.asarray(structured(model, cover, system.gauge.shear))
                     )
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
-        if with_uncertainty and model.equations is not None:
+        if with_uncertainty and problem.terms:
             columns = model.equations.columns
             kept_parts = replace(
                 kept_parts,
@@ -794,7 +793,6 @@ def _beside_map(
 ) -> dict[str, np.ndarray]:
     """Return what a unit of each coefficient makes of the plate, the lines and the microscope."""
     problem = model.problem
-    columns = cast(TermEquations, model.equations).columns
     system, length = problem.system, problem.half_width_m
     if system.grid.n_sites > MAX_FULL:
         return {}
@@ -812,7 +810,7 @@ def _beside_map(
                 column.term == of_offsets.name and column.component == component
                 for component in MICROSCOPE_PARTS
             ]
-            for column in columns.columns
+            for column in model.equations.columns.columns
         ],
         dtype=float,
     )

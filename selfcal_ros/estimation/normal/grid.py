@@ -184,6 +184,6 @@ class GridSystem(PlateEliminated):
 
 def of_misalignments(sums: np.ndarray) -> np.ndarray:
     """Return sums over phi and tau of each view (2 views, ...) as phi, Re tau, Im tau."""
-    pairs = sums.reshape(-1, 2, *sums.shape[1:])
-    phi_and_tau = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
-    return np.stack(phi_and_tau, axis=1).reshape(-1, *sums.shape[1:])
+    phi, tau = sums[::2], sums[1::2]
+    of_views = np.stack([phi.real, tau.real, tau.imag], axis=1)
+    return of_views.reshape(3 * len(phi), *sums.shape[1:])

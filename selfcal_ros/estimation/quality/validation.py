@@ -44,7 +44,7 @@ from selfcal_ros.estimation.normal.equations import (
 from selfcal_ros.estimation.observability.plan_check import SEARCH_SIZE, candidate_views
 from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
+from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import (
     TermInputs,
@@ -115,29 +115,25 @@ def held_readings(
             places.differences(model.fitted.field), np.zeros(len(grid.index))
         )
     equations = model.equations
-    n = 0 if equations is None else equations.n
-    of_terms: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
+    of_terms: np.ndarray = np.zeros((equations.n, *grid.y.shape), dtype=complex)
     own_columns = [of_terms[:0]]
-    if equations is not None:
-        inputs = _in_time_of(inputs, grid, fitted, held_out)
-        columns = term_columns(inputs, problem.terms)
-        row_of_column = {
-            (c.term, c.view, c.component): k
-            for k, c in enumerate(equations.columns.columns)
-        }
-        for column, block in zip(columns.columns, columns.grid, strict=True):
-            if block_of(column.term).of_lines:
-                continue  # its views are those with lines, and no mark has a part of it
-            shared = column.view == -1
-            row = (
-                -1 if shared else _fitted_row(problem.inputs, inputs, rows, column.view)
+    inputs = _in_time_of(inputs, grid, fitted, held_out)
+    columns = term_columns(inputs, problem.terms)
+    row_of_column = {
+        (c.term, c.view, c.component): k
+        for k, c in enumerate(equations.columns.columns)
+    }
+    for column, block in zip(columns.columns, columns.grid, strict=True):
+        if block_of(column.term).of_lines:
+            continue  # its views are those with lines, and no mark has a part of it
+        shared = column.view == -1
+        row = -1 if shared else _fitted_row(problem.inputs, inputs, rows, column.view)
+        if row < 0 and not shared:
+            own_columns.append(
+                np.where(np.isfinite(column.size), column.size, 0.0) * block[None]
             )
-            if row < 0 and not shared:
-                own_columns.append(
-                    np.where(np.isfinite(column.size), column.size, 0.0) * block[None]
-                )
-            elif (key := (column.term, row, column.component)) in row_of_column:
-                of_terms[row_of_column[key]] += block
+        elif (key := (column.term, row, column.component)) in row_of_column:
+            of_terms[row_of_column[key]] += block
     return HeldReadings(grid, of_terms, rows, np.concatenate(own_columns), place_change)
 
 
@@ -248,7 +244,7 @@ def line_errors(solved: Solved, held_out: AngularData) -> np.ndarray:
     )
     lines = lines_of(held_out)
     error = held_out.y - lines.gather(field) - plate
-    terms = NO_LINES if model.equations is None else model.equations.columns.lines
+    terms = model.equations.columns.lines
     for error_of_view, index in zip(error, held_out.index, strict=True):
         if index in fitted and len(terms.at):
             error_of_view -= (
@@ -303,9 +299,7 @@ def prediction_limit(
         model.fitted.xy.sigma, FLOOR
     )
     views = maps_of(held_out.grid)
-    columns = np.zeros((0, *grid.weight.shape))
-    if model.equations is not None:
-        columns = model.equations.columns.grid
+    columns = model.equations.columns.grid
     squares = np.zeros(n)
     for draw in range(n):
         field = fields[:, draw].reshape(grid.views.shape)
@@ -344,8 +338,6 @@ def _fitted(
     fields, parameters = (
         np.stack(solutions_of, axis=1) for solutions_of in zip(*drawn, strict=True)
     )
-    if model.equations is None:
-        return fields, parameters, np.zeros((0, len(noise)))
     now = equations_of(problem, joint_fit, model.equations.columns)
     shapes = now.columns.shapes
     right = np.stack(

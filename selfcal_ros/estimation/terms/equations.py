@@ -79,15 +79,14 @@ class ReducedColumns:
 @lru_cache(maxsize=2)
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     """Return columns with the sites eliminated; the last ones are kept."""
-    sites, inner, coupling = _marks_eliminated(grid, shapes)
-    inner -= grid.factor.products(sites)
-    return ReducedColumns(
-        grid,
-        shapes,
-        sites,
-        (inner + inner.conj().T) / 2,
-        coupling - _coupled(grid, sites),
-    )
+    sites: np.ndarray = np.zeros((grid.n_sites, 0), dtype=complex)
+    inner: np.ndarray = np.zeros((0, 0), dtype=complex)
+    coupling: np.ndarray = np.zeros((2 * grid.n_views, 0), dtype=complex)
+    if shapes.n:  # a model without terms takes no time
+        sites, inner, coupling = _marks_eliminated(grid, shapes)
+        inner -= grid.factor.products(sites)
+        coupling -= _coupled(grid, sites)
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2, coupling)
 
 
 def _marks_eliminated(

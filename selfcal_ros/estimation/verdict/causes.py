@@ -541,12 +541,11 @@ def find_explanations(
         A slip that competes with the others.
     """
     problem = model.problem
-    at_visits = (
-        ()
-        if model.equations is None
-        else model.equations.columns.at_visits(model.coefficients)
+    inputs = without_noise(
+        problem.inputs,
+        model.fitted.residuals,
+        model.equations.columns.at_visits(model.coefficients),
     )
-    inputs = without_noise(problem.inputs, model.fitted.residuals, at_visits)
     own_terms = [term.name for term in problem.terms]
     visits_known = all(visits is not None for visits in inputs.visits)
     further_terms = [
@@ -804,8 +803,6 @@ def fitted_term(
     model: ModelFit, name: str, p: float = 1.0, *, determined: bool = True
 ) -> Explanation:
     """Return a term of the model with its fitted coefficients and its effect."""
-    if model.equations is None:
-        raise ValueError(f"the model does not have the term {name}")
     equations = equations_of(model.problem, model.fitted, model.equations.columns)
     rows = equations.rows([name])
     covariance = model.covariance[np.ix_(rows, rows)] * model.fitted.xy.sigma**2
@@ -830,7 +827,7 @@ def scatter_of_views(
     """
     revisited = (
         {}
-        if model is None or model.equations is None
+        if model is None or not model.problem.terms
         else {
             model.problem.grid.index[row]: (visits, residuals)
             for row, visits, residuals in model.visits_about_means()

@@ -337,7 +337,7 @@ def _sign_findings(
     model = (
         solved.model if options.finite_rotations else _rigid_fit(measurements, options)
     )
-    if model is None or model.equations is None:
+    if model is None:
         return []
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)

@@ -172,8 +172,6 @@ def _of_marks(model: ModelFit) -> PlacedEquations:
 
 def _of_terms(model: ModelFit, of_other_map: ModelFit) -> float:
     """Return what the terms change of a map by what another map makes of them, rms, m."""
-    if model.equations is None:
-        return 0.0
     map_change_m = model.equations.maps @ (
         of_other_map.coefficients - model.coefficients
     )
