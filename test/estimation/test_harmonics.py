@@ -119,7 +119,8 @@ def test_missed_harmonics_are_named(turns, text):
     )
     assert named.startswith(text)
     assert found.observability.deficiency == 2 * len(re.findall(r"\d+", text))
-    cured = replace(views, views=(*views.views, *found.cures[0]))
+    advice = found.observability.advice[0]
+    cured = replace(views, views=(*views.views, *advice.views))
     assert check_plan(cured).observability.identifiable
     with refused("turned by"):
         calibrate(measured(views)[1], BARE)

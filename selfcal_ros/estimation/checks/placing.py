@@ -59,26 +59,18 @@ class PlacingError(InputError):
 
 @dataclass(frozen=True)
 class Misplaced:
-    """A view in which the plate is not placed as planned; turns in degrees, shifts in pitches.
-
-    `gain` is that of the log-likelihood; infinite if known from ids.
-    """
+    """A view in which the plate is not placed as planned; turns in degrees, shifts in pitches."""
 
     view: str
     planned_deg: float
     found_deg: float
     planned_shift: tuple[float, float]
     found_shift: tuple[float, float]
-    gain: float = float("inf")
 
     @classmethod
-    def of(
-        cls, view: str, planned: StagePose, lies: StagePose, gain: float = float("inf")
-    ) -> "Misplaced":
+    def of(cls, view: str, planned: StagePose, lies: StagePose) -> "Misplaced":
         """Return the difference of two poses."""
-        return cls(
-            view, planned.turn_deg, lies.turn_deg, planned.shift, lies.shift, gain
-        )
+        return cls(view, planned.turn_deg, lies.turn_deg, planned.shift, lies.shift)
 
 
 @dataclass(frozen=True)
@@ -89,7 +81,6 @@ class Mirrored:
     """
 
     axes: tuple[str, ...]
-    gain: float
 
 
 MIRRORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -201,7 +192,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     second = tried[1][0] if len(tried) > 1 else 0.0
     if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
-    return Misplaced.of(view.plan_view, planned_pose, pose, gain)
+    return Misplaced.of(view.plan_view, planned_pose, pose)
 
 
 def _mirrored(
@@ -229,7 +220,7 @@ def _mirrored(
             gains[name] = likelihood - planned
     best = max(gains.values(), default=0.0)
     axes = tuple(name for name, gain in gains.items() if gain > best - CLEARLY)
-    return Mirrored(axes, best) if axes else None
+    return Mirrored(axes) if axes else None
 
 
 def _at_pose(

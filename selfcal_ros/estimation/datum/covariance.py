@@ -524,8 +524,7 @@ def _solve_conditions(
 ) -> Conditions:
     """Return the least-squares response of the angular equations, given phi of the grid views."""
     angular = system.angular
-    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
-    inverse = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
+    free, inverse = _free_rotations(system)
     response = angular.response[:, free]
     spread = angular.solve(rows.T)
     spread = spread + response @ (inverse @ (response.T @ rows.T))
@@ -539,6 +538,13 @@ def _solve_conditions(
     phi_gain = np.zeros((angular.n_views, n))
     phi_gain[free] = -inverse @ (response.T @ rows.T) @ solved[:n]
     return Conditions(ThetaDatum.XY_AXES, rows, slopes, gain, phi_gain)
+
+
+def _free_rotations(system: NormalEquations) -> tuple[list[int], np.ndarray]:
+    """Return the views of lines alone, and the covariance of their rotations, unit noise."""
+    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
+    information = system.angular.schur[np.ix_(free, free)]
+    return free, np.linalg.pinv(information, hermitian=True)
 
 
 def misclosure_test(
@@ -746,11 +752,8 @@ def lines_alone(system: NormalEquations) -> LinesCovariance:
 
     The grid determines them thousands of times better than the lines.
     """
-    angular = system.angular
     inverse = np.zeros((system.size, system.size))
-    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
+    free, of_free = _free_rotations(system)
     at = system.phi_at[free]
-    inverse[np.ix_(at, at)] = np.linalg.pinv(
-        angular.schur[np.ix_(free, free)], hermitian=True
-    )
+    inverse[np.ix_(at, at)] = of_free
     return LinesCovariance(MapsCovariance(system, inverse), (1.0, 1.0))

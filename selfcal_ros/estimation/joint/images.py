@@ -10,11 +10,12 @@ noise make of them, with the terms that only images show fitted to them as to th
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from selfcal_ros.estimation.normal.angular import GAP
-from selfcal_ros.estimation.normal.equations import N_DRAWS, Memo, NormalEquations
+from selfcal_ros.estimation.normal.equations import N_DRAWS, NormalEquations
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.artifact import Artifact
@@ -208,7 +209,7 @@ def image_noise(
     system: NormalEquations,
     *,
     inputs: TermInputs,
-    terms: Sequence[ModelTerm] = (),
+    terms: Sequence[ModelTerm],
 ) -> ImageNoise | None:
     """Return the images behind grid readings; None without images.
 
@@ -225,18 +226,21 @@ def image_noise(
     terms : sequence of ModelTerm
         Terms of the model that only images show.
     """
-    key = cells_seen(artifact, [views[index] for index in system.grid_index])
-    if key is None:
+    cells = cells_seen(artifact, [views[index] for index in system.grid_index])
+    if cells is None:
         return None
-    nominal = replace(inputs, visits=(None,) * len(inputs.names))
-    return _known.get(
-        system,
-        (key, tuple(term.name for term in terms)),
-        lambda: _drawn(system, key, term_columns(nominal, terms).grid),
-    )
+    drawn = _drawn_before.setdefault(system, {})
+    key = cells, tuple(term.name for term in terms)
+    if key not in drawn:
+        nominal = replace(inputs, visits=(None,) * len(inputs.names))
+        drawn[key] = _drawn(system, cells, term_columns(nominal, terms).grid)
+    return drawn[key]
 
 
-_known: Memo[tuple, ImageNoise] = Memo()
+_drawn_before: WeakKeyDictionary[NormalEquations, dict[tuple, ImageNoise]] = (
+    WeakKeyDictionary()
+)
+"""Images of systems, by their cells and terms; they must not refer to the system."""
 
 
 def _fitted_terms(system: NormalEquations, columns: np.ndarray) -> FittedTerms:

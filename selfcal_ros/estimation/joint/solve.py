@@ -252,7 +252,7 @@ def saved_terms(
     cover: MapsCovariance,
     columns: TermColumns,
     sense: Sense,
-    other_effects: dict[str, np.ndarray] | None = None,
+    other_effects: dict[str, np.ndarray],
 ) -> Factors | None:
     """Return the factors of the terms; None for large fields.
 
@@ -264,11 +264,10 @@ def saved_terms(
         The terms.
     sense : Sense
         What moved: the factors are in the stage frame.
-    other_effects : dict of float array (p, ...), optional
+    other_effects : dict of float array (p, ...)
         What a unit of each coefficient makes of other quantities, see `Factors`.
     """
     shape = cover.system.grid.views.shape
-    other_effects = other_effects or {}
     if cover.system.grid.n_sites > MAX_FULL:
         return None
     maps = cover.maps_of_terms()[0]
@@ -277,10 +276,7 @@ def saved_terms(
         [maps.real.reshape(-1, maps.shape[2]), maps.imag.reshape(-1, maps.shape[2])]
     )
     other_quantities = np.concatenate(
-        [
-            np.zeros((0, maps.shape[2])),
-            *(values.reshape(len(values), -1).T for values in other_effects.values()),
-        ]
+        [values.reshape(len(values), -1).T for values in other_effects.values()]
     )
     factors, names, beside_map, beside_alone = [], [], [], []
     for name, root in roots_by_term(cover.terms.covariance, columns):
@@ -296,15 +292,11 @@ def saved_terms(
             other_quantities @ (root - root @ projector), full_matrices=False
         )
         beside_alone += list((directions * size).T[size > NEGLIGIBLE])
-    factors_of_map = Factors(
-        tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape))
-    )
-    if not other_effects:
-        return factors_of_map
     all_of = np.array([*beside_map, *beside_alone]).reshape(-1, len(other_quantities))
     ends = np.cumsum([values[0].size for values in other_effects.values()])[:-1]
-    return replace(
-        factors_of_map,
+    return Factors(
+        tuple(names),
+        rounded(np.array(factors).reshape(-1, 2, *shape)),
         with_map=len(names),
         beside={
             name: rounded(values_of.reshape(len(values_of), *values.shape[1:]))
@@ -478,7 +470,7 @@ def prepare(
             tuple(v.view for v in measurements.views),
         )
         if not identifies(plan.artifact, plan.views):
-            observability = with_unseen_modes(observability, system, plan).observability
+            observability = with_unseen_modes(observability, system, plan)
         raise NotIdentifiableError(
             "the marks that were read do not identify the stage "
             f"({observability.deficiency} mode{'s' * (observability.deficiency != 1)} "

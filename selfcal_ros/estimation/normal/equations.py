@@ -9,10 +9,9 @@ the datum is below `KNOWN` readings' noise; the datum is that of the known nodes
 Equations are made once for each plan, planned or measured, and kept.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import cast
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import lapack
@@ -160,20 +159,17 @@ class NormalEquations:
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
-        values, vectors = np.linalg.eigh(self.angular.schur)
-        return pseudo_inverse(values, vectors, self.angular_scale)
+        return pseudo_inverse(*np.linalg.eigh(self.angular.schur), self.angular_scale)
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        held_modes, let_go = self._regularised
-        out = np.linalg.inv(self.normal(ratio) + held_modes) - let_go
-        return (out + out.T) / 2
-
-    @cached_property
-    def _regularised(self) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix that makes the normal matrix regular, and its effect on the inverse."""
+        # the undetermined modes are held, and let go again
         held_modes = self.grid_scale * (self._null @ self._null.T)
-        return held_modes, held_modes / self.grid_scale**2
+        out = (
+            np.linalg.inv(self.normal(ratio) + held_modes)
+            - held_modes / self.grid_scale**2
+        )
+        return (out + out.T) / 2
 
     @cached_property
     def rank_grid(self) -> int:
@@ -716,24 +712,3 @@ def planned_system(artifact: Artifact, views: Sequence[View]) -> NormalEquations
     """
     readings = planned_readings(artifact, views)
     return _equations(grid_data(readings), angular_data(readings))
-
-
-class Memo[Key, Value]:
-    """Values by system and key; the values must not reference the system.
-
-    If two threads compute the same value at the same time, one of them is kept.
-    """
-
-    def __init__(self) -> None:
-        self._values: WeakKeyDictionary[NormalEquations, dict[Key, Value]] = (
-            WeakKeyDictionary()
-        )
-
-    def get(
-        self, system: NormalEquations, key: Key, make: Callable[[], Value]
-    ) -> Value:
-        """Return the value of `key` for `system`, computed by `make` the first time."""
-        values = self._values.setdefault(system, {})
-        if key not in values:
-            values[key] = make()
-        return values[key]

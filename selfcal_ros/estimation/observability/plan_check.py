@@ -133,33 +133,30 @@ class PlanCheck:
     ----------
     observability : Observability
         Rank, deficiency, unseen modes, advice.
-    cures : tuple of tuple of View
-        The smallest sets of views that would make the plan identify the stage.
     unknown_sites : int
         Sites, or nodes of the map, that remain unknown although the plan identifies the stage.
     """
 
     observability: Observability
-    cures: tuple[tuple[View, ...], ...] = ()
     unknown_sites: int = 0
 
 
 @one_thread()
 def check_plan(plan: Plan) -> PlanCheck:
-    """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
+    """Return rank, deficiency, unseen modes and advice of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
     observability = with_unchecked(
         full_observability(system, plan.artifact, plan.views), system
     )
     if not observability.identifiable:
-        return with_unseen_modes(observability, system, plan)
+        return PlanCheck(with_unseen_modes(observability, system, plan))
     return PlanCheck(observability, unknown_sites=int((~system.known_sites).sum()))
 
 
 def with_unseen_modes(
     observability: Observability, system: NormalEquations, plan: Plan
-) -> PlanCheck:
-    """Return the check of a deficient set of readings: unseen modes, and cures.
+) -> Observability:
+    """Return the observability of a deficient set of readings: unseen modes, and cures.
 
     Parameters
     ----------
@@ -170,15 +167,16 @@ def with_unseen_modes(
     plan : Plan
         The views behind the readings.
     """
-    modes = tuple(unseen_modes(system))
-    cures = tuple(find_cures(plan))
     advice = tuple(
-        kind(views=tuple(cure), plate=plan.artifact)
-        for kind, cure in zip((AddViews, OrAddViews, OrAddViews), cures, strict=False)
+        kind(views=cure, plate=plan.artifact)
+        for kind, cure in zip(
+            (AddViews, OrAddViews, OrAddViews), find_cures(plan), strict=False
+        )
     )
-    return PlanCheck(
-        replace(observability, modes=modes, advice=advice or observability.advice),
-        cures,
+    return replace(
+        observability,
+        modes=tuple(unseen_modes(system)),
+        advice=advice or observability.advice,
     )
 
 

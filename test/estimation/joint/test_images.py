@@ -190,6 +190,7 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
         [v.view for v in measurements.views],
         system,
         inputs=term_inputs(measurements, grid),
+        terms=(),
     )
     left = np.eye(len(matrix)) - matrix @ inverse
     together = np.kron(stops[:, None] == stops, np.eye(2))

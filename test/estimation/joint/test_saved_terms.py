@@ -35,7 +35,13 @@ def kept(shape, sense=Sense.MICROSCOPE_MOVES, size=float("inf")):
         WithinMarks(np.zeros((1, 1)), np.zeros(1), 0.0, 0),
         [],
     )
-    return field, known, saved_terms(cover_of(field, known), columns, sense)
+    return (
+        field,
+        known,
+        saved_terms(
+            cover_of(field, known), columns, sense, {"microscope": np.zeros((1, 4))}
+        ),
+    )
 
 
 @pytest.mark.parametrize(
