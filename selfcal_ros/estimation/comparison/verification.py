@@ -9,7 +9,7 @@ difference is that of both maps, whatever acts.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -100,7 +100,7 @@ class Verification:
     remaining: Significance | None
     gx: np.ndarray
     gy: np.ndarray
-    g_theta: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    g_theta: np.ndarray
 
     @property
     def passed(self) -> bool:

@@ -83,8 +83,8 @@ class NoiseEstimate:
     residuals: float
     dof_repeats: float
     dof_residuals: float
-    declared: float = float("nan")
-    p: float = float("nan")
+    declared: float
+    p: float
 
     @property
     def stated(self) -> float:
@@ -570,7 +570,7 @@ class JointFit:
     xy: NoiseEstimate
     theta: NoiseEstimate
     inverse: np.ndarray
-    ratio: float = 0.0
+    ratio: float
 
     @property
     def both_residuals(self) -> tuple[np.ndarray, np.ndarray]:

@@ -158,9 +158,10 @@ def _in_time_of(
 ) -> TermInputs:
     """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
-    placings = inputs.placings or range(len(inputs.names))
-    ranges = time_ranges([fitted.views[index] for index in grid.index], placings)
-    for index, placing, view in zip(grid.index, placings, inputs.visits, strict=True):
+    ranges = time_ranges([fitted.views[index] for index in grid.index], inputs.placings)
+    for index, placing, view in zip(
+        grid.index, inputs.placings, inputs.visits, strict=True
+    ):
         own_visits = held_out.views[index].visits
         if view is None or own_visits is None or placing not in ranges:
             visits.append(view)

@@ -52,7 +52,7 @@ class KnownPlate:
         What it knows of stage and plate together.
     where : str
         Its file, for messages.
-    reference : ReferenceLength, optional
+    reference : ReferenceLength or None
         Reference length of the calibration at the temperature of the plate now; None if that
         temperature or the length is not known: then no map has a scale.
     """
@@ -60,7 +60,7 @@ class KnownPlate:
     result: CalibrationResult
     together: Together
     where: str
-    reference: ReferenceLength | None = None
+    reference: ReferenceLength | None
 
     @property
     def field(self) -> np.ndarray:

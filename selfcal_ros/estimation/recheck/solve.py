@@ -133,7 +133,7 @@ class Rechecked:
     lines: NewMap
     xy: NoiseEstimate
     theta: NoiseEstimate
-    microscope: "SeenMicroscope | None" = None
+    microscope: "SeenMicroscope | None"
 
     @property
     def artifact(self) -> Artifact:

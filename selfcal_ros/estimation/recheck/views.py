@@ -214,7 +214,7 @@ class PlateReadings:
     columns: TermColumns
     effects: Effects
     variance: float
-    shows_microscope: bool = False
+    shows_microscope: bool
 
     @cached_property
     def known(self) -> np.ndarray:

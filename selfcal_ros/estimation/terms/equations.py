@@ -263,8 +263,8 @@ class TermEquations:
     system: NormalEquations
     columns: TermColumns
     projected: ProjectedColumns
-    noise_m: float = 0.0
-    line_weight: float = 0.0
+    noise_m: float
+    line_weight: float
 
     @property
     def n(self) -> int:

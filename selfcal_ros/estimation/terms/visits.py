@@ -6,7 +6,7 @@ the visits of one mark about their mean determines terms that differ between the
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -268,12 +268,12 @@ class TermInputs:
         lines share rotations.
     placings : tuple of int
         First view of the placing of the plate to which each view belongs: the cells of an image
-        see one plate, bent and drifting alike. Empty: each view is a placing.
+        see one plate, bent and drifting alike.
     placing_names : tuple of str
         Names of the placings of the views.
     cells_m : complex array (views,)
         Place of the cell of each view in its image, stage axes; 0 without images.
-    stage : Artifact, optional
+    stage : Artifact
         Its sites, or the nodes of the map.
     drift_degree : int
         Degree of the polynomial of a view's time that a block may have.
@@ -287,23 +287,21 @@ class TermInputs:
     weight: np.ndarray
     visits: tuple[ViewVisits | None, ...]
     names: tuple[str, ...]
-    sense: Sense = Sense.MICROSCOPE_MOVES
-    line_names: tuple[str, ...] = ()
-    n_lines: int = 0
-    line_offsets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    with_lines: tuple[int, ...] = ()
-    placings: tuple[int, ...] = ()
-    placing_names: tuple[str, ...] = ()
-    cells_m: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
-    stage: Artifact | None = None
-    drift_degree: int = DRIFT_DEGREE
-    poses: tuple[Pose, ...] = ()
+    sense: Sense
+    line_names: tuple[str, ...]
+    n_lines: int
+    line_offsets: np.ndarray
+    with_lines: tuple[int, ...]
+    placings: tuple[int, ...]
+    placing_names: tuple[str, ...]
+    cells_m: np.ndarray
+    stage: Artifact
+    drift_degree: int
+    poses: tuple[Pose, ...]
 
     @property
     def node_axes_m(self) -> list[np.ndarray]:
         """Places along x and y of nodes of a term over the field, in the sense of (1.6), m."""
-        if self.stage is None:
-            return []
         most = max(2, int(np.sqrt(MOST_VALUES / (len(self.names) * self.z.size))))
         return [
             np.linspace(-half, half, min(sites, most, MOST_NODES))
@@ -361,7 +359,7 @@ class TermInputs:
     def members(self) -> dict[int, list[int]]:
         """Views of each placing of the plate, by the first of them."""
         out: dict[int, list[int]] = {}
-        for view, first in enumerate(self.placings or range(len(self.names))):
+        for view, first in enumerate(self.placings):
             out.setdefault(first, []).append(view)
         return out
 
@@ -370,7 +368,7 @@ class TermInputs:
         block = blocks().get(term)
         if block is None or block.shared:
             return self.names
-        return self.line_names if block.of_lines else self.placing_names or self.names
+        return self.line_names if block.of_lines else self.placing_names
 
     def has(self, term: str) -> bool:
         """Return whether any reading can depend on a term."""

@@ -629,7 +629,6 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
         return Provenance(version=__version__, extra=extra)
     duration_s = (last - first) / NS_PER_S
     return Provenance(
-        created="",
         duration_s=duration_s,
         version=__version__,
         extra=extra,

@@ -180,6 +180,23 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * wanted.max())
 
 
+def test_images_are_drawn_once_for_each_system():
+    measurements = whole(0.0)[0]
+    grid = grid_data(measurements)
+    system = system_of(grid, angular_data(measurements))
+
+    def images():
+        return image_noise(
+            measurements.artifact,
+            [v.view for v in measurements.views],
+            system,
+            inputs=term_inputs(measurements, grid),
+            terms=(),
+        )
+
+    assert images() is images()
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.06])
 def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
     measurements, matrix, stops, inverse = whole(missing)

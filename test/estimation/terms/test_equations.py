@@ -27,7 +27,7 @@ def equations(columns, size, whole, *, taken=()):
     """
     left = columns.copy()
     left[:, taken] *= 1e-16
-    own = Made(None, SimpleNamespace(columns=size, size=size), None)
+    own = Made(None, SimpleNamespace(columns=size, size=size), None, 0.0, 0.0)
     own.__dict__.update(
         information=left.T @ left,
         unbiased=left.T @ left,
