@@ -66,6 +66,18 @@ class ErrorMap:
     scale_difference: float = 0.0
     datum_theta: ThetaDatum = ThetaDatum.ZERO_MEAN
 
+    @classmethod
+    def of_maps(
+        cls,
+        artifact: Artifact,
+        xy: tuple[np.ndarray, np.ndarray],
+        theta: tuple[np.ndarray, np.ndarray],
+    ) -> "ErrorMap":
+        """Return a map with its O and R, from Gx, Gy (2, nx, ny), Gtheta (K,) and their u."""
+        (gx, gy), (u_gx, u_gy) = xy
+        o, r = first_order(artifact, xy[0])
+        return cls(artifact, gx, gy, u_gx, u_gy, *theta, o, r)
+
     @property
     def u_xy(self) -> np.ndarray:
         """Standard uncertainty of both coordinates, (2, nx, ny), m."""

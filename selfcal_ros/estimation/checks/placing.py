@@ -559,4 +559,5 @@ def placing_error(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingE
 
 
 def _pitches(shift: tuple[float, float]) -> str:
-    return f"({shift[0] + 0.0:+g}, {shift[1] + 0.0:+g}) pitches"
+    x, y = np.round(shift, 6) + 0.0
+    return f"({x:+g}, {y:+g}) pitches"

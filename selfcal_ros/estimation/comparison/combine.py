@@ -45,9 +45,7 @@ from selfcal_ros.model.budget import BudgetLine, OfRuns
 from selfcal_ros.model.error_map import (
     MANY_DOF,
     ErrorMap,
-    ThetaDatum,
     datum_columns,
-    first_order,
     rms,
 )
 from selfcal_ros.model.findings import BetweenRuns, EnlargedRuns, Finding, NotInAll
@@ -903,10 +901,10 @@ def _result(
     plate = first.plate
     known_sites = common["xy"]
     shapes = {"xy": (2, *known_sites.shape), "theta": (1, len(common["theta"]))}
-    maps = {
-        kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()
-    }
-    u = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
+    maps, u = (
+        {kind: np.full(shape, np.nan) for kind, shape in shapes.items()}
+        for _ in range(2)
+    )
     dof = dict.fromkeys(KINDS, np.nan)
     k = dict.fromkeys(KINDS, 2.0)
     for kind, mean in means.items():
@@ -914,19 +912,10 @@ def _result(
             out[:, common[kind]] = values.reshape(len(out), -1)
         dof[kind], k[kind] = mean.dof, coverage_factor(mean.dof)
 
-    (gx, gy), (u_gx, u_gy) = maps["xy"], u["xy"]
-    o, r = first_order(first.artifact, maps["xy"])
-    emap = ErrorMap(
-        artifact=first.artifact,
-        gx=gx,
-        gy=gy,
-        u_gx=u_gx,
-        u_gy=u_gy,
-        g_theta=maps["theta"][0],
-        u_g_theta=u["theta"][0],
-        nonorthogonality=o,
-        scale_difference=r,
-        datum_theta=ThetaDatum.ZERO_MEAN,
+    emap = ErrorMap.of_maps(
+        first.artifact,
+        (maps["xy"], u["xy"]),
+        (maps["theta"][0], u["theta"][0]),
     )
     unknown = np.full(plate.shape, np.nan)
     unknowns = 2 * int(known_sites.sum())

@@ -31,7 +31,7 @@ from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import Marks, in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import NormalEquations, system_of
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, first_order
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
@@ -268,11 +268,6 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
 def share_of(result: CalibrationResult) -> float:
     """Return the part of the variance of a reading that the marks of an image share; 0 without."""
     return 0.0 if result.kept.images is None else result.kept.images.share
-
-
-def dof_of_marks(result: CalibrationResult) -> float:
-    """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
-    return 0.0 if result.kept.images is None else result.kept.images.dof_mark
 
 
 def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
@@ -623,7 +618,6 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
         np.full(artifact.shape, np.nan),
         np.full(artifact.angular_count, np.nan),
     )
-    o, r = first_order(artifact, np.stack([plate_map.ax, plate_map.ay]))
     u_x, u_y, u_theta = (
         u if u.size else empty
         for u, empty in (
@@ -632,18 +626,9 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
             (plate_map.u_a_theta, none),
         )
     )
-    return replace(
-        result,
-        placed_plate=None,
-        error_map=ErrorMap(
-            artifact=artifact,
-            gx=plate_map.ax,
-            gy=plate_map.ay,
-            u_gx=u_x,
-            u_gy=u_y,
-            g_theta=plate_map.a_theta,
-            u_g_theta=u_theta,
-            nonorthogonality=o,
-            scale_difference=r,
-        ),
+    emap = ErrorMap.of_maps(
+        artifact,
+        (np.stack([plate_map.ax, plate_map.ay]), np.stack([u_x, u_y])),
+        (plate_map.a_theta, u_theta),
     )
+    return replace(result, placed_plate=None, error_map=emap)

@@ -254,22 +254,12 @@ class MapsCovariance:
     @cached_property
     def of_stage(self) -> np.ndarray:
         """Variances of Gx and Gy at every site, (2, nx, ny); NaN if unknown."""
-        system = self.system
-        variance = self._of_map(plate=False) + self._of_length(
-            system.grid.views.z_sites
-        )
-        return np.where(
-            system.known_sites, variance.reshape(2, *system.known_sites.shape), np.nan
-        )
+        return self._of_map(plate=False)
 
     @cached_property
     def of_plate(self) -> np.ndarray:
         """Variances of Ax and Ay at every mark, (2, nx, ny); NaN if unknown."""
-        system = self.system
-        variance = self._of_map(plate=True) + self._of_length(system.grid.views.z)
-        return np.where(
-            system.known_marks, variance.reshape(2, *system.known_marks.shape), np.nan
-        )
+        return self._of_map(plate=True)
 
     def maps_of_terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps for a unit of each coefficient in the datum, (sites, p), (marks, p)."""
@@ -292,10 +282,6 @@ class MapsCovariance:
     def functionals(self, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return functionals (k, nx, ny) of the stage's map as those of the free maps."""
         return self._functionals(sites, None)[:2]
-
-    def _of_length(self, z: np.ndarray) -> np.ndarray:
-        """Return the variances that the reference itself adds at places, (2, places)."""
-        return (np.stack([z.real, z.imag]).reshape(2, -1) * self._u) ** 2
 
     def _functionals(
         self, sites: np.ndarray, marks: np.ndarray | None
@@ -378,8 +364,9 @@ class MapsCovariance:
         return grid.solve(g) - grid.response @ parameters, parameters, of_coefficients
 
     def _of_map(self, *, plate: bool) -> np.ndarray:
-        """Return the variances of a map in its datum, (2, places), but for the reference's own."""
+        """Return the variances of a map in its datum, (2, nx, ny); NaN if unknown."""
         grid = self.system.grid
+        z, known_places = grid.views.z_sites, self.system.known_sites
         fields, g, a = self._datum(plate=plate)
         field, parameters, of_coefficients = self._solved(g, a)
         own_variance = grid.variance_of_sites
@@ -391,13 +378,16 @@ class MapsCovariance:
             own_variance = noise + grid.variance_of_means
             of_terms = self.terms.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
-        return in_datum(
+            z, known_places = grid.views.z, self.system.known_marks
+        variance = in_datum(
             own_variance,
             ((answer, self._p), (of_terms, self.terms.covariance)),
             field - of_terms @ of_coefficients,
             fields,
             self.of_free(g, a),
         )
+        of_length = (np.stack([z.real, z.imag]) * self._u) ** 2
+        return np.where(known_places, variance.reshape(2, *z.shape) + of_length, np.nan)
 
     def _plates(self, fields: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return what maps (sites, k) and misalignments (3 views, k) make of the plate."""

@@ -383,8 +383,6 @@ def weight_ratio(
 
     Without both noises, an angular reading counts like a grid reading at the half width.
     """
-    if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
-        return 1.0
     sigma_xy = max(sigma_xy, LEAST_NOISE_M, ROUNDING * float(np.abs(y).max()))
     peak = float(np.abs(problem.angular.y).max())
     sigma_theta = max(sigma_theta, ROUNDING * peak, least_noise_rad(problem, sigma_xy))

@@ -159,24 +159,15 @@ def grid_data(measurements: Measurements) -> GridData:
         pose = _grid_pose(readings, artifact)
         where = f"view '{readings.view.name}' grid readings"
         flat = _flat_marks(readings, artifact, where=where)
-        if not len(readings.dx) == len(readings.dy) == len(flat):
-            raise InputError(
-                where, "marks and deviations differ in length", "give one value a mark"
-            )
-        if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
-            # before it is turned: infinity by a complex number warns
-            raise InputError(
-                where, "a deviation is not a finite number", "remove the mark"
-            )
-        values = (readings.dx + 1j * readings.dy) * pose.phase.conjugate()
-        _place(
-            y[row].reshape(-1),
+        _weigh(
             weight[row].reshape(-1),
             flat,
-            values=values,
+            values=(readings.dx, readings.dy),
             count=readings.count,
             where=where,
         )
+        deviations = readings.dx + 1j * readings.dy
+        y[row].reshape(-1)[flat] = deviations * pose.phase.conjugate()
         ones.append((flat, readings.count, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
@@ -209,14 +200,14 @@ def angular_data(measurements: Measurements) -> AngularData:
                 "a line that the plate does not have",
                 f"lines are 0 to {artifact.angular_count - 1}",
             )
-        _place(
-            y[row],
+        _weigh(
             weight[row],
             k,
-            values=np.asarray(readings.dtheta),
+            values=(readings.dtheta,),
             count=readings.count_theta,
             where=where,
         )
+        y[row, k] = readings.dtheta
         ones.append((k, readings.count_theta, readings.u_theta))
         about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
         turns.append(turn + about if artifact.harmonics and about else turn)
@@ -260,26 +251,25 @@ def _flat_marks(
     return flat
 
 
-def _place(
-    y: np.ndarray,
+def _weigh(
     weight: np.ndarray,
     flat: np.ndarray,
     *,
-    values: np.ndarray,
+    values: tuple[np.ndarray, ...],
     count: np.ndarray,
     where: str,
 ) -> None:
-    if values.shape != flat.shape or np.shape(count) != flat.shape:
+    """Weigh the marks read, in place, by their counts; check these and the deviations."""
+    if any(np.shape(of_marks) != flat.shape for of_marks in (*values, count)):
         raise InputError(
             where,
             "marks, deviations and counts differ in length",
             "give one value a mark",
         )
-    if not np.isfinite(values).all():
+    if not all(np.isfinite(deviations).all() for deviations in values):
         raise InputError(where, "a deviation is not a finite number", "remove the mark")
     if np.min(count) < 1:
         raise InputError(where, "a count below 1", "leave out marks that were not read")
-    y[flat] = values
     weight[flat] = count
     if np.count_nonzero(weight) != len(flat):
         raise InputError(where, "a mark comes twice", "average its readings first")

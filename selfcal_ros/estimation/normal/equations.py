@@ -159,7 +159,8 @@ class NormalEquations:
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
-        return pseudo_inverse(*np.linalg.eigh(self.angular.schur), self.angular_scale)
+        values, vectors = np.linalg.eigh(self.angular.schur)
+        return pseudo_inverse(values, vectors, self.angular_scale)
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""

@@ -141,11 +141,6 @@ class PlannedTerms:
         self.all_terms = planned_equations(plan, system, sized, assumed)
         self.of_model = with_terms(self.all_terms, self.model)
 
-    def require_determined(self, observability: Observability) -> None:
-        """Raise NotIdentifiableError if free terms of the model hide modes of the stage."""
-        if self.of_model.free.any():
-            require_terms_determined(self.of_model, observability)
-
     def with_free_terms(self, observability: Observability) -> Observability:
         """Return the observability of the plan with the free terms of its model as unknowns.
 
@@ -155,7 +150,7 @@ class PlannedTerms:
             Observability without them.
         """
         try:
-            self.require_determined(observability)
+            require_terms_determined(self.of_model, observability)
         except NotIdentifiableError as error:
             return error.observability
         free = int(self.of_model.free.sum())

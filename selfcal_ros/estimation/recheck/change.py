@@ -265,7 +265,8 @@ def _compared(
         As `map_change`.
     """
     old, sites = plate.result.error_map, plate.together.sites
-    rows, known_before = _on_nodes(artifact, plate)
+    z = (artifact.x_m + 1j * artifact.y_m).ravel()
+    rows, known_before = rows_at(z, plate)
     common = new.known & np.tile(known_before, 2)
     if common.sum() < 6:
         raise InputError(
@@ -284,8 +285,8 @@ def _compared(
     modes = datum_modes(artifact, scale=True).reshape(4, -1).T[common]
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
-    z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[: artifact.m.size]]
-    return common, values, ChangeTests(covariance, basis, dof, z)
+    places = z[common[: len(z)]]
+    return common, values, ChangeTests(covariance, basis, dof, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,21 +406,6 @@ def scale_row(modes: np.ndarray) -> np.ndarray:
     """Return the least-squares scale as a row, (n,), given translations, rotation and scale."""
     size = np.abs(modes).max(axis=0)
     return np.linalg.pinv(modes / size)[3] / size[3]
-
-
-def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows from known nodes of the old map to those of another, and where it is known.
-
-    Rows (n, s), and nodes of the other map, bool (n,).
-    """
-    known_sites = plate.together.sites.ravel()
-    old = plate.result.artifact
-    if (
-        artifact.shape == old.shape
-        and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP
-    ):
-        return np.eye(len(known_sites))[:, known_sites], known_sites
-    return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
 
 def recheck_found(

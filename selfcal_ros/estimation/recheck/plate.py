@@ -33,7 +33,7 @@ from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.findings import Finding, OtherPlate
-from selfcal_ros.model.pose import EDGE
+from selfcal_ros.model.pose import EDGE, PlacedPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
@@ -510,20 +510,13 @@ def _size(remaining: np.ndarray) -> float:
 def _misplaced(
     view: ViewReadings, read_marks: _ReadMarks, pose: tuple[complex, complex]
 ) -> Misplaced:
-    """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
-    deg = np.degrees(view.view.rotation_rad)
-    shift = read_marks.shift + read_marks.turn * pose[1]
-    planned, lies_at = (
-        tuple(float(np.round(coordinate, 6)) for coordinate in (place.real, place.imag))
-        for place in (read_marks.shift, shift)
-    )
-    turned = deg + np.degrees(np.angle(pose[0]))
-    return Misplaced(
+    """Return how the plate lies in place of its planned pose."""
+    turn, shift = read_marks.turn, read_marks.shift
+    lies_at = shift + turn * pose[1]
+    return Misplaced.of(
         view.view.name,
-        round(float(deg) % 360, 6),
-        round(float(turned) % 360, 6),
-        (planned[0], planned[1]),
-        (lies_at[0], lies_at[1]),
+        PlacedPose(turn, (shift.real, shift.imag), None),
+        PlacedPose(turn * pose[0], (lies_at.real, lies_at.imag), None),
     )
 
 

@@ -14,7 +14,6 @@ from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import (
-    dof_of_marks,
     kept_covariances,
     share_of,
 )
@@ -78,13 +77,7 @@ from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.budget import BudgetLine, Details, OfNoise, OfPlate
-from selfcal_ros.model.error_map import (
-    ErrorMap,
-    ThetaDatum,
-    datum_modes,
-    first_order,
-    rms,
-)
+from selfcal_ros.model.error_map import ErrorMap, datum_modes, rms
 from selfcal_ros.model.findings import (
     Changed,
     ChangedOrDrifted,
@@ -167,28 +160,17 @@ class Rechecked:
 
     def error_map(self) -> ErrorMap:
         """Return the map with its uncertainty."""
-        artifact, xy = self.artifact, self.in_datum
-        variance = np.sum(list(self.variances.values()), axis=0)
-        (gx, gy), (u_x, u_y) = (
-            xy.on_whole_map(values).reshape(2, *artifact.shape)
-            for values in (xy.values, np.sqrt(variance))
-        )
+        artifact, xy, lines = self.artifact, self.in_datum, self.lines
+        u_xy = np.sqrt(np.sum(list(self.variances.values()), axis=0))
         u_theta = np.sqrt(np.diag(self.of_lines))
-        theta, u_theta = (
-            self.lines.on_whole_map(values) for values in (self.lines.values, u_theta)
+        values, u = (
+            xy.on_whole_map(of_nodes).reshape(2, *artifact.shape)
+            for of_nodes in (xy.values, u_xy)
         )
-        o, r = first_order(artifact, np.stack([gx, gy]))
-        return ErrorMap(
-            artifact=artifact,
-            gx=gx,
-            gy=gy,
-            u_gx=u_x,
-            u_gy=u_y,
-            g_theta=theta,
-            u_g_theta=u_theta,
-            nonorthogonality=o,
-            scale_difference=r,
-            datum_theta=ThetaDatum.ZERO_MEAN,
+        return ErrorMap.of_maps(
+            artifact,
+            (values, u),
+            (lines.on_whole_map(lines.values), lines.on_whole_map(u_theta)),
         )
 
 
@@ -334,8 +316,10 @@ def _failed(
     if other_plate is not None:
         failed: tuple[Finding, ...] = (other_plate,)
     else:
-        of_images = solved.measurements.has_images
-        dof_noise = dof_of_marks(solved.plate.result) if of_images else solved.xy.dof
+        dof_noise = solved.xy.dof
+        images = solved.plate.result.kept.images
+        if images is not None and solved.measurements.has_images:
+            dof_noise = images.dof_mark
         failed = _misfit(solved.solution.square, solved.readings.dof, dof_noise)
     if not changes:
         return failed

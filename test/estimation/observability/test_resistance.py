@@ -16,6 +16,7 @@ from selfcal_ros.estimation.observability.resistance import (
     check_terms,
     nominal_sizes,
 )
+from selfcal_ros.estimation.terms.equations import require_terms_determined
 from selfcal_ros.estimation.terms.planned import (
     Assumed,
     planned_equations,
@@ -163,7 +164,7 @@ def test_free_terms_that_are_not_told_are_named_with_their_cure():
     with pytest.raises(
         NotIdentifiableError, match=r"do not separate drift .*\(7 modes"
     ):
-        planned.require_determined(seen)
+        require_terms_determined(planned.of_model, seen)
     found = planned.with_free_terms(seen)
     assert (found.rank, found.unknowns) == (seen.rank + 18 - 7, seen.unknowns + 18)
     assert (found.deficiency, found.identifiable) == (7, False)
