@@ -282,3 +282,12 @@ def block_of(name: str) -> Block:
             "model", f"the term '{name}' is unknown", known_are(name, known_blocks)
         )
     return known_blocks[name]
+
+
+PLAIN = Block("", "m", patterns=lambda inputs, term: (), undetected=0.0)
+"""A block without traits."""
+
+
+def traits_of(name: str) -> Block:
+    """Return the block of a name, or one without traits for what is not a block, as a slip."""
+    return blocks().get(name, PLAIN)

@@ -4,7 +4,7 @@
 from dataclasses import replace
 from functools import cache
 
-from selfcal_ros.blocks import block_of, blocks
+from selfcal_ros.blocks import traits_of
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import (
@@ -185,15 +185,11 @@ def _fits(result: CalibrationResult) -> bool:
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    causes_of_blocks = [
-        (cause, block_of(cause.name))
-        for cause in result.verdict.causes
-        if cause.name in blocks()
-    ]
     failed = {type(finding) for finding in result.verdict.failed}
     return failed <= {SignShownByLines} and not any(
-        block.between or abs(cause.size) > block.plausible
-        for cause, block in causes_of_blocks
+        traits_of(cause.name).between
+        or abs(cause.size) > traits_of(cause.name).plausible
+        for cause in result.verdict.causes
     )
 
 

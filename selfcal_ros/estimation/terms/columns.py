@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, block_of, blocks
+from selfcal_ros.blocks import Block, block_of, blocks, traits_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, squares_within
 from selfcal_ros.model.terms import ModelTerm
@@ -242,7 +242,7 @@ class Column:
     @property
     def unit(self) -> str:
         """SI unit of the coefficient."""
-        return blocks()[self.term].unit if self.term in blocks() else "m"
+        return traits_of(self.term).unit
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from itertools import compress
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.blocks import AXES, Located, block_of, blocks
+from selfcal_ros.blocks import AXES, Located, block_of, blocks, traits_of
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
@@ -623,7 +623,7 @@ def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
     """
     of_view = np.array([c.view for c in columns], dtype=int)
     tested_alone = np.array(
-        [c.term in blocks() and blocks()[c.term].alone(c.component) for c in columns],
+        [traits_of(c.term).alone(c.component) for c in columns],
         dtype=bool,
     )
     for name in names:
@@ -667,7 +667,7 @@ def select_explanations(
             if group is best or _replaces(pool, in_model, group, best)
         ]
         # the best part of each term; what all views share is simpler than what each view has
-        as_good.sort(key=lambda item: (not _is_shared(item[1].name), -item[0][1]))
+        as_good.sort(key=lambda item: (not traits_of(item[1].name).shared, -item[0][1]))
         names: list[str] = []
         for (p, _), group in as_good:
             if group.name not in names:
@@ -687,16 +687,12 @@ def select_explanations(
     return explanations
 
 
-def _is_shared(name: str) -> bool:
-    return name in blocks() and blocks()[name].shared
-
-
 def _replaces(
     pool: Candidates, in_model: np.ndarray, group: Group, best: Group
 ) -> bool:
     """Return whether `best` explains nothing beyond what `group` explains."""
     if any(
-        name not in blocks() or blocks()[name].between
+        name not in blocks() or block_of(name).between
         for name in (group.name, best.name)
     ):
         return False
@@ -778,7 +774,6 @@ def cause_of(explanation: Explanation, inputs: TermInputs) -> Cause:
         ((fields, *_linear(explanation, weights)) for fields, weights in options),
         key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300),
     )
-    unit = blocks()[explanation.name].unit if explanation.name in blocks() else "m"
     largest = (
         0.0
         if explanation.map_change is None
@@ -789,7 +784,7 @@ def cause_of(explanation: Explanation, inputs: TermInputs) -> Cause:
             "name": explanation.name,
             "size": value,
             "u": u,
-            "unit": unit,
+            "unit": traits_of(explanation.name).unit,
             "p": explanation.p,
             "effect_rms": explanation.effect_m,
             "effect_max": largest,

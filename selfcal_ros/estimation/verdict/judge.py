@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from selfcal_ros import __version__
-from selfcal_ros.blocks import blocks
+from selfcal_ros.blocks import traits_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import (
     LEAST_NOISE_M,
@@ -468,10 +468,7 @@ def _scale_findings(
     if (
         np.isinf(u)
         or fitted
-        or any(
-            cause.name in blocks() and blocks()[cause.name].of_microscope
-            for cause in causes
-        )
+        or any(traits_of(cause.name).of_microscope for cause in causes)
     ):
         return []
     response = contradicted_scale(measurements, u)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.blocks import block_of, blocks
+from selfcal_ros.blocks import block_of, blocks, traits_of
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solve import factors_of, variance_of_terms
 from selfcal_ros.estimation.normal.angular import MAX_FULL
@@ -492,8 +492,7 @@ def _term_line(
     determined = remaining < DETERMINED_BELOW
     by_images = (
         result.camera is not None
-        and name in blocks()
-        and block_of(name).of_microscope
+        and traits_of(name).of_microscope
         and term.source == "default"
     )
     largest = max(
