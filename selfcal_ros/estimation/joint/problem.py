@@ -6,7 +6,7 @@ What is to be fitted, the noise of a reading, how the two kinds of readings weig
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc, stdtrit
@@ -246,11 +246,6 @@ class Problem:
         Whether the plate turns by finite angles, or as in the papers' linear form.
     terms : tuple of ModelTerm
         Terms of the model beside stage, plate and misalignments.
-    residuals_xy : tuple, optional
-        (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
-        after terms were taken off.
-    dof_lines : float
-        Degrees of freedom that terms take from the readings of lines.
     turn_rad : float array (grid views,)
         Angle by which the frame of each view's readings is turned, see `turned`.
     places : StagePlaces, optional
@@ -259,6 +254,11 @@ class Problem:
         Whether readings have the stage error of that place, or that of the site of their mark.
     images : ImageNoise, optional
         Images behind the readings, whose marks share noise; None without images.
+    residuals_xy : tuple, optional
+        (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
+        after terms were taken off.
+    dof_lines : float
+        Degrees of freedom that terms take from the readings of lines.
     """
 
     system: NormalEquations
@@ -269,15 +269,15 @@ class Problem:
     half_width_m: float
     conditions: Conditions
     inputs: TermInputs
-    reference: ReferenceLength | None = None
-    rigid: bool = True
-    terms: tuple[ModelTerm, ...] = ()
+    reference: ReferenceLength | None
+    rigid: bool
+    terms: tuple[ModelTerm, ...]
+    turn_rad: np.ndarray
+    places: StagePlaces | None
+    at_places: bool
+    images: ImageNoise | None
     residuals_xy: tuple[float, float] | None = None
     dof_lines: float = 0.0
-    turn_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    places: StagePlaces | None = None
-    at_places: bool = True
-    images: ImageNoise | None = None
 
     @property
     def moves(self) -> bool:
@@ -478,9 +478,9 @@ def problem_of(
         inputs.half_width_m,
         conditions,
         inputs,
-        options.reference,
-        rigid,
-        terms,
+        reference=options.reference,
+        rigid=rigid,
+        terms=terms,
         turn_rad=np.zeros(len(readings[0].index)),
         places=places_of(measurements, readings[0], inputs, system.known_sites),
         at_places=options.at_places,

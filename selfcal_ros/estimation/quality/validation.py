@@ -51,6 +51,7 @@ from selfcal_ros.estimation.terms.visits import (
     ViewVisits,
     term_inputs,
     time_ranges,
+    view_time,
 )
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
@@ -166,8 +167,7 @@ def _in_time_of(
         if view is None or own_visits is None or placing not in ranges:
             visits.append(view)
             continue
-        first, last = ranges[placing]
-        time = 2 * (own_visits.stamp_ns - first) / max(last - first, 1) - 1
+        time = view_time(own_visits.stamp_ns, *ranges[placing])
         visits.append(replace(view, time=time))
     return replace(inputs, visits=tuple(visits))
 
