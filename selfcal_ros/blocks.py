@@ -126,6 +126,16 @@ def by_coefficient(estimates: Estimates, names: tuple[str, ...]) -> Located:
         )
 
 
+def differences(
+    values: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far coefficients (p,) are apart, (p, p), and that in standard uncertainties."""
+    variance = np.diag(covariance)
+    spread = variance[:, None] + variance - 2 * covariance
+    apart = np.abs(values[:, None] - values)
+    return apart, apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """One effect.

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotation: the plate turns between the marks and the lines of a view; Vtheta has r."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Estimates, Located, Pattern
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, differences
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -20,39 +21,22 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
 
 def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the view that differs most from all others: a common rotation belongs to the datum."""
-    n = len(estimates.values)
-    unit = np.eye(len(estimates.values))
-    distinctness = []
-    for at in range(n):
-        differences = [
-            unit[at] - unit[another] for another in range(n) if another != at
-        ]
-        distinctness.append(
-            min(
-                (
-                    abs(estimates.values @ weights) / _u(estimates, weights)
-                    for weights in differences
-                ),
-                default=0.0,
-            )
-        )
-    at = int(np.argmax(distinctness))
-    weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
+    _, of_u = differences(estimates.values, estimates.covariance)
+    n = len(of_u)
+    # a single one is that of the second view against the first
+    distinctness = np.where(np.eye(n) > 0, np.inf, of_u).min(axis=1)
+    at = int(distinctness.argmax())
+    unit = np.eye(n)[at]
+    weights = unit - (1 - unit) / max(n - 1, 1)
+    variance = max(float(weights @ estimates.covariance @ weights), 0.0)
     # u is that of the difference from the nearest
     nearest = abs(float(estimates.values @ weights)) / max(distinctness[at], 1e-300)
     yield (
         {
             "view": names[estimates.columns[at].view],
-            "u": max(_u(estimates, weights), nearest),
+            "u": max(math.sqrt(variance), nearest),
         },
         weights,
-    )
-
-
-def _u(estimates: Estimates, weights: np.ndarray) -> float:
-    """Return the standard uncertainty of weights @ values, at least the least number."""
-    return max(
-        float(np.sqrt(max(weights @ estimates.covariance @ weights, 0.0))), 1e-300
     )
 
 

@@ -24,7 +24,7 @@ from itertools import compress
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.blocks import AXES, Located, block_of, blocks, traits_of
+from selfcal_ros.blocks import AXES, Located, block_of, blocks, differences, traits_of
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
@@ -930,10 +930,7 @@ def turned_too_far(
     first = len(model.problem.inputs.with_lines) - len(rotations.values)
     values = np.pad(rotations.values, (first, 0))
     covariance = np.pad(rotations.covariance, (first, 0))
-    apart = abs(values[:, None] - values)
-    variance = np.diag(covariance)
-    spread = variance[:, None] + variance - 2 * covariance
-    of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
+    apart, of_u = differences(values, covariance)
     phi = [
         view.phi
         for view, readings in zip(result.views, measurements.views, strict=True)

@@ -5,6 +5,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from selfcal_ros import blocks as registry
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.files import read_yaml, write_yaml
 from selfcal_ros.model.findings import Cause
 from selfcal_ros.model.terms import default_terms, parse_terms
@@ -171,3 +173,19 @@ def test_every_block_has_its_sizes(name):
     assert block.name == name and block.cure and block.unit in ("m", "m/m", "rad")
     assert 0 < block.undetected < 2e-3 * min((*block.sizes, block.nominal or math.inf))
     assert len(block.parts) in (0, len(block.sizes))
+
+
+@pytest.mark.parametrize(
+    ("turns", "u"),
+    [([1e-5], 1e-7), ([1e-5, 1e-6], 2**0.5 * 1e-7)],
+)
+def test_the_turn_of_lines_has_the_u_of_its_difference_from_the_nearest(turns, u):
+    """A single one is that of the second view against the first: it has its own u."""
+    n = len(turns)
+    estimates = SimpleNamespace(
+        columns=[Column("rotation", view, "turn", np.inf) for view in range(n)],
+        values=np.array(turns),
+        covariance=1e-14 * np.eye(n),
+    )
+    ((fields, _),) = block_of("rotation").located(estimates, tuple("ab"))
+    assert fields["u"] == pytest.approx(u, rel=1e-9)
