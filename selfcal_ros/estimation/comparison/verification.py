@@ -130,10 +130,8 @@ class _Maps:
         The errors, one axis after the other.
     cover_before, cover_after : float array (n, n) or (n,)
         Their covariances, or variances.
-    datum : float array (n, k)
-        The datum's columns, orthonormal.
-    dof : float
-        Degrees of freedom of the sum of both covariances.
+    noise : ReducedNoise
+        Noise of the correction that acts, of both maps together.
     """
 
     kind: str
@@ -142,22 +140,12 @@ class _Maps:
     after: np.ndarray
     cover_before: np.ndarray
     cover_after: np.ndarray
-    datum: np.ndarray
-    dof: float
-
-    @property
-    def cover(self) -> np.ndarray:
-        """Covariance of the correction that acts."""
-        return self.cover_before + self.cover_after
+    noise: ReducedNoise
 
     @property
     def action(self) -> np.ndarray:
         """The correction that acts, without its part in the datum, (n,)."""
-        return self.free(self.before - self.after)
-
-    def free(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, ...) without their part in the datum."""
-        return values - self.datum @ (self.datum.T @ values)
+        return self.noise.without(self.before - self.after)
 
     def by_axis(self, values: np.ndarray) -> np.ndarray:
         """Return values (n,) by their axis, (axes, places)."""
@@ -166,12 +154,12 @@ class _Maps:
     @property
     def columns(self) -> np.ndarray:
         """The error before as a column of each axis, (n, axes)."""
-        return self.free(_columns(self.by_axis(self.before)))
+        return self.noise.without(_columns(self.by_axis(self.before)))
 
     @cached_property
     def remaining(self) -> Significance | None:
         """Test of the error with the correction on, with the covariance of both maps."""
-        return significance(self.after, ReducedNoise(self.cover, self.datum, self.dof))
+        return significance(self.after, self.noise)
 
     @property
     def remains(self) -> bool:
@@ -231,14 +219,14 @@ class _Maps:
             return [(float("nan"), float("nan"))] * len(products)
         weights = np.linalg.solve(products, columns.T).T
         values = np.linalg.solve(products, columns.T @ self.action - noise)
-        u = np.sqrt(variances_of(self.cover, weights))
+        u = np.sqrt(variances_of(self.noise.covariance, weights))
         return list(zip(values.tolist(), u.tolist(), strict=True))
 
     def unexplained(self, explained: np.ndarray) -> float:
         """Return the part of the squares that is unexplained, noise taken off."""
         size = max(_square(self.action), _square(self.before))
         remaining = _square(self.action - explained) - float(
-            variances(self.cover).sum()
+            variances(self.noise.covariance).sum()
         )
         return max(remaining, 0.0) / size if size else 0.0
 
@@ -319,7 +307,7 @@ def verify(
             "measure where the map is known",
         )
     maps = _maps(before, after, "xy", known_nodes)
-    if not np.isfinite(maps.cover).all():
+    if not np.isfinite(maps.noise.covariance).all():
         raise InputError(
             names[0] if np.isfinite(second.u_gx[known_nodes]).all() else names[1],
             "has no uncertainty, so nothing can be verified",
@@ -395,8 +383,7 @@ def _maps(
         after=free[1],
         cover_before=covers[0],
         cover_after=covers[1],
-        datum=datum,
-        dof=dof,
+        noise=ReducedNoise(covers[0] + covers[1], datum, dof),
     )
 
 
@@ -442,7 +429,7 @@ def _fault(maps: _Maps, emap: ErrorMap) -> TableFault:
     for fault, field_of in _arranged(emap.gx, emap.gy).items():
         arranged = np.stack(field_of)[:, maps.known]
         if np.isfinite(arranged).all():
-            action = maps.free(_columns(arranged))
+            action = maps.noise.without(_columns(arranged))
             weights = np.linalg.lstsq(action, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
                 unexplained[fault] = maps.unexplained(action @ weights)

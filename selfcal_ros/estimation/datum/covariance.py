@@ -199,7 +199,7 @@ class MapsCovariance:
         marks : complex array (k, nx, ny), optional
             Factors of the plate's map.
         """
-        g, a, grown = self._functionals(sites, marks)
+        g, a, grown = self.functionals(sites, marks)
         return self.of_free(g, a) + np.outer(grown, grown) * self._u**2
 
     def of_free(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -233,7 +233,7 @@ class MapsCovariance:
         """
         grid = self.system.grid
         terms = self.terms
-        g, a, _ = self._functionals(sites, marks)
+        g, a, _ = self.functionals(sites, marks)
         field, parameters, of_coefficients = self._solved(g, a)
         maps = (field - terms.fields @ of_coefficients).T.reshape(-1, *grid.views.shape)
         y = np.tensordot(of_coefficients.T, terms.columns, axes=1)
@@ -279,12 +279,8 @@ class MapsCovariance:
             self.terms.plates.conj().T @ a
         )
 
-    def functionals(self, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return functionals (k, nx, ny) of the stage's map as those of the free maps."""
-        return self._functionals(sites, None)[:2]
-
-    def _functionals(
-        self, sites: np.ndarray, marks: np.ndarray | None
+    def functionals(
+        self, sites: np.ndarray, marks: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return functionals (k, nx, ny) of the maps as those of free maps, (sites, k), (marks, k).
 
@@ -603,7 +599,7 @@ class LinesCovariance:
         misclosure = (
             -rows,
             np.zeros(rows.shape),
-            self.cover.functionals(conditions.slopes),
+            self.cover.functionals(conditions.slopes)[:2],
         )
         closure = self.of(*misclosure)
         y = self.angular.response

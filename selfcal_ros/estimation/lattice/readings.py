@@ -168,7 +168,7 @@ def grid_data(measurements: Measurements) -> GridData:
         )
         deviations = readings.dx + 1j * readings.dy
         y[row].reshape(-1)[flat] = deviations * pose.phase.conjugate()
-        ones.append((flat, readings.count, readings.u))
+        ones.append((flat, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
     return GridData(
@@ -208,7 +208,7 @@ def angular_data(measurements: Measurements) -> AngularData:
             where=where,
         )
         y[row, k] = readings.dtheta
-        ones.append((k, readings.count_theta, readings.u_theta))
+        ones.append((k, readings.u_theta))
         about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
         turns.append(turn + about if artifact.harmonics and about else turn)
     sigma = _declare(weight, ones)
@@ -281,10 +281,10 @@ def _declare(weight: np.ndarray, ones: list[tuple]) -> float:
     Sigma is the rms of u sqrt(count) over the declared marks; marks without a declaration are
     treated as readings of that sigma.
     """
-    if not any(len(u) for _, _, u in ones):
+    if not any(len(u) for _, u in ones):
         return float("nan")
     total, number = 0.0, 0
-    for row, (flat, _, u) in enumerate(ones):
+    for row, (flat, u) in enumerate(ones):
         if len(u):
             good = np.isfinite(u) & (u > 0)
             # summed in lattice order: the result does not depend on the order of readings
@@ -294,7 +294,7 @@ def _declare(weight: np.ndarray, ones: list[tuple]) -> float:
     if not number:
         return float("nan")
     variance = total / number
-    for row, (flat, _, u) in enumerate(ones):
+    for row, (flat, u) in enumerate(ones):
         if len(u):
             good = np.isfinite(u) & (u > 0)
             weight[row].reshape(-1)[flat[good]] = variance / u[good] ** 2

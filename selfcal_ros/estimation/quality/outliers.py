@@ -634,10 +634,12 @@ def _reject(
 ) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
     """Remove outliers round by round; return them, the last residuals, and why it stopped early."""
     outliers: dict[Key, Removed] = {}
+    stopped: Finding | None = OutliersGivenUp(rounds=MAX_STEPS)
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
     for _ in range(MAX_STEPS):
         worst = _worst(residuals, measurements)
         if not worst:
+            stopped = None
             break
         if len(outliers) + len(worst) > MAX_REMOVED * n_readings:
             return (
@@ -650,12 +652,7 @@ def _reject(
         except NotIdentifiableError:
             return outliers, residuals, OutliersKept()
         outliers |= worst
-    else:
-        return (
-            *_restored(measurements, options, outliers, residuals),
-            OutliersGivenUp(rounds=MAX_STEPS),
-        )
-    return (*_restored(measurements, options, outliers, residuals), None)
+    return (*_restored(measurements, options, outliers, residuals), stopped)
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:

@@ -64,12 +64,6 @@ class StagePlaces:
         """How far the stage stood off the sites, in pitches (rms)."""
         return rms(np.abs(self.away_m)) / self.pitch_m
 
-    @cached_property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal place of the mark of each reading, in pitches from the first node, (P,) each."""
-        s, t = self.views.from_corner
-        return s[self.at], t[self.at]
-
     def differences(
         self, field: np.ndarray, near: np.ndarray | None = None, *, local: bool = False
     ) -> np.ndarray:
@@ -152,8 +146,8 @@ class StagePlaces:
     def _place(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where the stage truly stood, in pitches from the corner of the field, (P,)."""
         away = (self.away_m - error) / self.pitch_m
-        i, j = self.nominal
-        return i + away.real, j + away.imag
+        s, t = self.views.from_corner  # nominal places of the marks
+        return s[self.at] + away.real, t[self.at] + away.imag
 
     def _cells(self, field: np.ndarray, *, local: bool = False) -> Cells:
         """Return the interpolant of a field between the nodes of the map."""
