@@ -24,7 +24,7 @@ from selfcal_ros.estimation.datum.covariance import (
     conditions_for,
     lines_alone,
 )
-from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
+from selfcal_ros.estimation.joint.images import Images
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solve import factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
@@ -158,7 +158,8 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         shear = factors.system.gauge.shear
         saved = factors_of(result)
         row = turned_over(result.sense, shear).conj()
-        common = _complex(saved.of_map[saved.of_fields])
+        along_x, along_y = saved.of_map[saved.of_fields].swapaxes(0, 1)
+        common = along_x + 1j * along_y
         of_terms = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
         added = result.kept.added
         variance = (
@@ -205,11 +206,6 @@ def _noisier(result: CalibrationResult) -> float:
     stated = np.nansum(result.error_map.u_xy**2) / result.noise.sigma_xy**2
     effects = (saved.of_map[saved.with_map :] ** 2).sum()
     return float(1 + more / (stated - effects))
-
-
-def _complex(factors: np.ndarray) -> np.ndarray:
-    """Return factors (r, 2, nx, ny) as complex fields, (r, nx, ny)."""
-    return factors[:, 0] + 1j * factors[:, 1]
 
 
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
@@ -386,21 +382,15 @@ class Together:
         )
 
     @cached_property
-    def _images(self) -> ImageNoise | None:
-        """The images, for `added_covariance` alone; None without images."""
+    def _images(self) -> Images | None:
+        """The images; None without images."""
         if not share_of(self.result):
             return None
         grid = self.system.grid
         cells_of_views = _cells_of_views(
             cast(ImagesKept, self.result.kept.images), grid.n_views
         )
-        return ImageNoise(
-            stops_of(cells_of_views, grid.read),
-            grid.read,
-            grid.weight[grid.read],
-            np.zeros((0, 2, 3)),
-            np.zeros((0, 2, 3 * grid.n_views)),
-        )
+        return Images.of(grid, cells_of_views)
 
     def stage_rows(self, known_sites: np.ndarray) -> np.ndarray:
         """Return the functionals Gx, then Gy, at sites, in the frame of the equations."""

@@ -315,13 +315,12 @@ def _determined(place: np.ndarray, powers: Powers) -> bool:
 
 def _place(views: Sequence[ViewReadings]) -> complex:
     """Return the mean published offset in a cell, stage axes, m."""
-    visited = [view for view in views if view.visits is not None]
     return complex(
         np.mean(
             [
                 view.view.cell_m
                 + (view.visits.offset_x + 1j * view.visits.offset_y).mean()
-                for view in visited
+                for view in views
                 if view.visits is not None
             ]
         )

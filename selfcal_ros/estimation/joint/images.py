@@ -16,6 +16,7 @@ import numpy as np
 
 from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.normal.equations import N_DRAWS, NormalEquations
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.artifact import Artifact
@@ -89,8 +90,8 @@ class FittedTerms:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageNoise:
-    """Images behind the grid readings, and what noise leaves in their residuals.
+class Images:
+    """Images behind the grid readings.
 
     Attributes
     ----------
@@ -101,30 +102,16 @@ class ImageNoise:
         The readings.
     weight : float array (n,)
         Their weights.
-    drawn : float array (draws, 2, 3)
-        Sums of squares of the residuals, and of the sums of images, for unit noise of marks, for
-        that of images, and of both together less these.
-    parameters : float array (draws, 2, 3 views)
-        Misalignments for unit noise of marks and of images, as in `JointFit`, m.
-    fitted : FittedTerms, optional
-        The terms of the draws.
-    gain : float
-        Variance of the map (mean over its nodes) for unit noise of images, over that for unit noise
-        of marks.
     """
 
     stop: np.ndarray
     read: np.ndarray
     weight: np.ndarray
-    drawn: np.ndarray
-    parameters: np.ndarray
-    fitted: FittedTerms | None = None
-    gain: float = 1.0
 
-    @property
-    def dof_of_terms(self) -> int:
-        """Degrees of freedom that these terms take."""
-        return 0 if self.fitted is None else self.fitted.rank
+    @classmethod
+    def of(cls, grid: GridSystem, views: CellsSeen) -> "Images":
+        """Return the images of readings; `views` as `stops_of` takes them."""
+        return cls(stops_of(views, grid.read), grid.read, grid.weight[grid.read])
 
     @property
     def marks(self) -> float:
@@ -138,26 +125,6 @@ class ImageNoise:
             self.stop, weighted.imag
         )
         return np.array([(abs(weighted) ** 2).sum(), (abs(of_images) ** 2).sum()])
-
-    def noises(self, residual: np.ndarray) -> TwoNoises:
-        """Return the noises that residuals (views, nx, ny) show."""
-        expected = self.drawn.mean(axis=0)
-        sums = self.sums(residual)
-        from_sums = np.linalg.inv(expected[:, :2])
-        variances = from_sums @ sums
-        if variances.min() < 0:  # one of the two alone
-            larger = int(variances[1] > variances[0])
-            from_sums = np.zeros((2, 2))
-            from_sums[larger, 0] = 1 / expected[0, larger]
-            variances = from_sums @ sums
-        mark, image = np.sqrt(variances)
-        drawn = self.drawn @ [mark**2, image**2, mark * image]
-        return TwoNoises(
-            float(image),
-            float(mark),
-            _dof_of(drawn @ ([1, self.gain] @ from_sums)),
-            _dof_of(drawn @ from_sums[0]),
-        )
 
     def of_marks(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return the variances, (k,), for unit noise of each mark by itself."""
@@ -189,6 +156,50 @@ class ImageNoise:
         )
         np.add.at(of_images.T, self.stop, of_marks.T)
         return of_marks, of_images
+
+
+@dataclass(frozen=True, eq=False)
+class ImageNoise(Images):
+    """Images behind the grid readings, and what noise leaves in their residuals.
+
+    Attributes
+    ----------
+    drawn : float array (draws, 2, 3)
+        Sums of squares of the residuals, and of the sums of images, for unit noise of marks, for
+        that of images, and of both together less these.
+    parameters : float array (draws, 2, 3 views)
+        Misalignments for unit noise of marks and of images, as in `JointFit`, m.
+    dof_of_terms : int
+        Degrees of freedom that the terms of the draws take.
+    gain : float
+        Variance of the map (mean over its nodes) for unit noise of images, over that for unit noise
+        of marks.
+    """
+
+    drawn: np.ndarray
+    parameters: np.ndarray
+    dof_of_terms: int
+    gain: float
+
+    def noises(self, residual: np.ndarray) -> TwoNoises:
+        """Return the noises that residuals (views, nx, ny) show."""
+        expected = self.drawn.mean(axis=0)
+        sums = self.sums(residual)
+        from_sums = np.linalg.inv(expected[:, :2])
+        variances = from_sums @ sums
+        if variances.min() < 0:  # one of the two alone
+            larger = int(variances[1] > variances[0])
+            from_sums = np.zeros((2, 2))
+            from_sums[larger, 0] = 1 / expected[0, larger]
+            variances = from_sums @ sums
+        mark, image = np.sqrt(variances)
+        drawn = self.drawn @ [mark**2, image**2, mark * image]
+        return TwoNoises(
+            float(image),
+            float(mark),
+            _dof_of(drawn @ ([1, self.gain] @ from_sums)),
+            _dof_of(drawn @ from_sums[0]),
+        )
 
 
 def marks_of_image(stop: np.ndarray) -> float:
@@ -269,35 +280,34 @@ def _drawn(
     `views` are the names in the plan and steps of cells.
     """
     grid = system.grid
-    stops = stops_of(views, grid.read)
-    weight = grid.weight[grid.read]
-    drawn = np.zeros((N_DRAWS, 2, 3))
+    images = Images.of(grid, views)
     fitted = _fitted_terms(system, columns)
-    plain = ImageNoise(
-        stop=stops,
-        read=grid.read,
-        weight=weight,
-        drawn=drawn,
-        parameters=np.zeros((N_DRAWS, 2, 3 * len(views))),
-        fitted=fitted,
-    )
+    drawn = np.zeros((N_DRAWS, 2, 3))
+    parameters = np.zeros((N_DRAWS, 2, 3 * len(views)))
     power = np.zeros(2)
     rng = np.random.default_rng(0)
-    for row, parameters in zip(drawn, plain.parameters, strict=True):
+    for row, of_draw in zip(drawn, parameters, strict=True):
         mark, image = (
             rng.normal(size=(size, 2)) @ [1, 1j]
-            for size in (len(stops), stops.max() + 1)
+            for size in (len(images.stop), images.stop.max() + 1)
         )
         solved = [
-            _solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])
+            _solved(system, values / np.sqrt(images.weight))
+            for values in (mark, image[images.stop])
         ]
         power += [of_noise[2] for of_noise in solved]
-        residuals, parameters[:] = zip(
+        residuals, of_draw[:] = zip(
             *(fitted.freed(*of_noise[:2]) for of_noise in solved), strict=True
         )
-        row[:, :2] = np.stack([plain.sums(of_noise) for of_noise in residuals], axis=1)
-        row[:, 2] = plain.sums(residuals[0] + residuals[1]) - row[:, 0] - row[:, 1]
-    return replace(plain, gain=float(power[1] / power[0]))
+        row[:, :2] = np.stack([images.sums(of_noise) for of_noise in residuals], axis=1)
+        row[:, 2] = images.sums(residuals[0] + residuals[1]) - row[:, 0] - row[:, 1]
+    return ImageNoise(
+        **vars(images),
+        drawn=drawn,
+        parameters=parameters,
+        dof_of_terms=fitted.rank,
+        gain=float(power[1] / power[0]),
+    )
 
 
 def stops_of(views: CellsSeen, read: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ from selfcal_ros.estimation.joint.problem import (
     angular_part,
     fit,
     grid_dof,
-    lines_have_their_weight,
+    least_noise_rad,
     noise_excess,
     sigma_of,
 )
@@ -437,7 +437,8 @@ def squares(
     if fitted.ratio > 0:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += max(shared - 1, 0)
-        if not of_noise or lines_have_their_weight(problem, fitted):
+        least_rad = least_noise_rad(problem, fitted.xy.sigma)
+        if not (of_noise and fitted.theta.sigma < least_rad):
             squares_rad = float(
                 (system.angular.weight * fitted.residuals_theta**2).sum()
             )

@@ -394,11 +394,6 @@ def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
     return max(LEAST_NOISE_RAD, LEAST_OF_MARKS * sigma_xy / problem.half_width_m)
 
 
-def lines_have_their_weight(problem: Problem, fitted: "JointFit") -> bool:
-    """Return whether lines weigh as their noise says; not if that is less than counts."""
-    return not fitted.theta.sigma < least_noise_rad(problem, fitted.xy.sigma)
-
-
 def bounded_ratio(
     system: NormalEquations, sigma_xy: float, sigma_theta: float, half_width_m: float
 ) -> float:

@@ -402,15 +402,7 @@ def _or_infinite(dof: float) -> float:
 
 def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     """Return the contribution of the noise of readings to a map."""
-    sigma, repeats, residuals, p = (
-        getattr(noise, name)
-        for name in (
-            f"sigma_{kind}",
-            f"sigma_{kind}_repeats",
-            f"sigma_{kind}_residuals",
-            f"p_{kind}",
-        )
-    )
+    sigma, p = getattr(noise, f"sigma_{kind}"), getattr(noise, f"p_{kind}")
     unit = "m" if kind == "xy" else "rad"
     if not (np.isfinite(sigma) and sigma > 0):
         return BudgetLine(
@@ -420,15 +412,13 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
             unit=unit,
             source="readings",
         )
-    dof = _dof(noise, kind)
-    by = (
-        "residuals"
-        if sigma == residuals
-        else "repeats"
-        if sigma == repeats
-        else "declared"
-        if sigma == getattr(noise, f"sigma_{kind}_declared")
-        else "together"
+    by = next(
+        (
+            source
+            for source in ("residuals", "repeats", "declared")
+            if getattr(noise, f"sigma_{kind}_{source}") == sigma
+        ),
+        "together",
     )
     return BudgetLine(
         quantity=kind,
@@ -438,7 +428,7 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
         unit=unit,
         effect_rms=rms(u),
         effect_max=float(np.nanmax(u)),
-        dof=dof,
+        dof=_dof(noise, kind),
         source="declared" if by == "declared" else "readings",
         details=OfNoise(by, contradicted=bool(p < F_LEVEL)),
     )
