@@ -491,7 +491,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
                 progress=progress,
             )
     # without terms (--against none) and --sigma the figures are gains
-    in_um = against is not None or args.sigma is not None
+    in_um = bool(against.all_terms) or args.sigma is not None
     judged = plan if args.views is None else best
     unit = _averaged_m(judged, plan_terms.assumed_of(args)) if in_um else None
     if args.views is not None:
@@ -523,7 +523,7 @@ def _in_order(plan: Plan, order: str) -> Plan:
     )
 
 
-def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
+def _against(args: argparse.Namespace, plan: Plan) -> Against:
     """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
     term_of = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
     term_of |= {
@@ -531,11 +531,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     }
     named = in_order(term_of.values())
     by_default = plan_terms.assumed_terms(args.against, named, plan)
-    return (
-        Against(named, plan_terms.assumed_of(args), by_default)
-        if named or by_default
-        else None
-    )
+    return Against(named, plan_terms.assumed_of(args), by_default)
 
 
 def _show_ranked(

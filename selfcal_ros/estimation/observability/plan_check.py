@@ -291,9 +291,9 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
 
 
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
+    grid_views = (view for view in (*plan.views, *views) if view.grid)
     return identifies(
-        plan.artifact,
-        [replace(view, angular=False) for view in (*plan.views, *views) if view.grid],
+        plan.artifact, tuple(replace(view, angular=False) for view in grid_views)
     )
 
 

@@ -12,7 +12,7 @@ move whole fields.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -70,18 +70,14 @@ def plan_observability(plan: Plan) -> Observability:
     return full_observability(system, plan.artifact, plan.views)
 
 
-def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
+@lru_cache
+def identifies(artifact: Artifact, views: tuple[View, ...]) -> bool:
     """Return whether views determine the whole map if every mark in the field is read.
 
     For searches: no advice, no matrix if the count of components already says no, and that of the
-    middle of a large field if it determines all misalignments.
+    middle of a large field if it determines all misalignments. Every fit of readings of which some
+    are missing asks for the same views.
     """
-    return _identifies(artifact, tuple(views))
-
-
-@lru_cache
-def _identifies(artifact: Artifact, views: tuple[View, ...]) -> bool:
-    """Tell it once: every fit of readings of which some are missing asks for the same views."""
     system = planned_system(artifact, views)
     if artifact.map_grid is not None:
         return _nodes_known(system)

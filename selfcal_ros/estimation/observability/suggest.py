@@ -217,6 +217,10 @@ class Against:
         return (*self.terms, *self.by_default)
 
 
+NOTHING = Against(())
+"""No terms: the uncertainty is that of the noise alone."""
+
+
 @dataclass(frozen=True)
 class Search:
     """How a plan was found.
@@ -253,7 +257,7 @@ def score_plan(
     datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
     *,
     repeats: int | None = None,
-    against: Against | None = None,
+    against: Against = NOTHING,
 ) -> PlanScore:
     """Return the score of a plan with every mark read.
 
@@ -271,7 +275,7 @@ def score_plan(
         return PlanScore(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
     prediction: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
-    if against is not None and against.all_terms:
+    if against.all_terms:
         terms = planned_equations(plan, system, against.all_terms, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
@@ -293,7 +297,7 @@ def rank_next(
     *,
     criterion: str = "rms",
     datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
-    against: Against | None = None,
+    against: Against = NOTHING,
     progress: Progress = no_progress,
 ) -> tuple[PlanScore, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
@@ -329,10 +333,9 @@ def rank_next(
     if plan.artifact.map_grid:
         views += _anywhere(plan, views, lambda added: score(added).key(criterion))
     steps = [*views, *more_repeats(plan)]
-    terms, all_terms = (against.terms, against.all_terms) if against else ((), ())
-    if any(term.block.change == "order" for term in terms):
+    if any(term.block.change == "order" for term in against.terms):
         steps += other_orders(plan)
-    if any(term.block.change == "check_stops" for term in all_terms):
+    if any(term.block.change == "check_stops" for term in against.all_terms):
         steps += check_stops(plan)
     out = []
     for number, step in enumerate(steps):
@@ -351,7 +354,7 @@ def best_plan(
     criterion: str = "rms",
     like: View | None = None,
     datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
-    against: Against | None = None,
+    against: Against = NOTHING,
     progress: Progress = no_progress,
 ) -> tuple[Plan, PlanScore, Search]:
     """Return the best plan of `n_views` views among the candidates, its score, and the search.
@@ -483,7 +486,7 @@ def _search(
     free: int,
     *,
     criterion: str,
-    against: Against | None,
+    against: Against,
     progress: Progress,
 ) -> tuple[dict[tuple[int, ...], tuple], Search]:
     """Return plans of the pool's first view and `free` others with their keys, and how found.
@@ -492,17 +495,14 @@ def _search(
     """
     pool = [replace(view, angular=False) for view in pool]
     keys: dict[tuple, tuple[float, ...]] = {}
-    one_by_one = against is not None and any(
-        term.block.needs_visits for term in against.terms
-    )
+    one_by_one = any(term.block.needs_visits for term in against.terms)
     # no choice of views determines the default terms of the visits
-    if against is not None:
-        against = replace(
-            against,
-            by_default=tuple(
-                term for term in against.by_default if not term.block.needs_visits
-            ),
-        )
+    against = replace(
+        against,
+        by_default=tuple(
+            term for term in against.by_default if not term.block.needs_visits
+        ),
+    )
 
     def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
         views = (pool[0], *(pool[i] for i in chosen))

@@ -103,7 +103,7 @@ def judged(
     advise : bool
         Whether remedies of causes are tried.
     """
-    noises = _noise_findings(solved)
+    noises = list(_noise_findings(solved))
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     is_same = checked is solved
     failed = _failed_tests(solved, checked, measurements, options)
@@ -113,7 +113,7 @@ def judged(
     causes = _with_declared_zeros(searched.causes, options)
     if is_same:
         solved = searched.solved
-        noises = _noise_findings(solved)
+        noises = list(_noise_findings(solved))
     explained = solved if is_same else checked
     failed += _scale_findings(explained, measurements, options, causes)
 
@@ -321,8 +321,8 @@ def checked_by(
 
 def _sign_findings(
     solved: Solved, measurements: Measurements, options: Options
-) -> list[Finding]:
-    """Return a finding if nothing shows the sign of the offsets, or lines alone do.
+) -> Iterator[Finding]:
+    """Yield a finding if nothing shows the sign of the offsets, or lines alone do.
 
     Repeats show it, or the joint fit does (through where the stage stood beside its targets,
     rotations that lines share, and their squares), or the microscope was declared. Lines share
@@ -333,12 +333,12 @@ def _sign_findings(
     )
     # nothing can show it
     if _is_declared(options) or not visits_known or sign_is_shown(measurements):
-        return []
+        return
     model = (
         solved.model if options.finite_rotations else _rigid_fit(measurements, options)
     )
     if model is None:
-        return []
+        return
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)
     scale = [
@@ -347,7 +347,7 @@ def _sign_findings(
         if equations.columns.columns[at].component == "scale"
     ]
     if not scale or not np.isfinite(model.fitted.xy.sigma):
-        return []
+        return
     lines = equations.columns.having(lambda block: block.of_offsets and block.of_lines)
 
     def is_shown(*, by_lines: bool) -> bool:
@@ -360,12 +360,9 @@ def _sign_findings(
     if with_lines and (
         is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)
     ):
-        return []
-    if _stops_show_the_sign(model, measurements):
-        return []
-    if with_lines:
-        return [SignShownByLines()]
-    return [SignNotShown()]
+        return
+    if not _stops_show_the_sign(model, measurements):
+        yield SignShownByLines() if with_lines else SignNotShown()
 
 
 def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
@@ -410,8 +407,8 @@ def _is_declared(options: Options) -> bool:
 
 def _lines_sign_findings(
     solved: Solved, measurements: Measurements, options: Options
-) -> list[Finding]:
-    """Return a finding if nothing shows the sign of the lines' offsets.
+) -> Iterator[Finding]:
+    """Yield a finding if nothing shows the sign of the lines' offsets.
 
     Their repeats show it, or the turns of the plate that marks and lines share: with the other
     sign the readings fit less well. Conditions of the axes show it by themselves, or the
@@ -424,13 +421,12 @@ def _lines_sign_findings(
         or options.datum_theta != ThetaDatum.ZERO_MEAN
         or not np.isfinite(solved.xy.sigma)
         or sign_of_lines_is_shown(measurements)
+        or not model.problem.system.angular.n_views
     ):
-        return []
+        return
     problem = replace(model.problem, terms=(), residuals_xy=None)
     angular = problem.angular
     squared = []
-    if not problem.system.angular.n_views:
-        return []
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
     turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
     # of the readings before they were turned into the frame of the plate
@@ -439,7 +435,8 @@ def _lines_sign_findings(
         read = replace(problem, angular=replace(angular, y=y))
         squared.append(squares(read, fit(read, model.y), of_noise=False)[0])
     worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
-    return [] if worse > -2 * np.log(SHOWN) else [LinesSignNotShown()]
+    if not worse > -2 * np.log(SHOWN):
+        yield LinesSignNotShown()
 
 
 def _scale_findings(
@@ -447,8 +444,8 @@ def _scale_findings(
     measurements: Measurements,
     options: Options,
     causes: Iterable[Cause],
-) -> list[Finding]:
-    """Return a finding if repeats contradict a scale of the microscope that is not fitted.
+) -> Iterator[Finding]:
+    """Yield a finding if repeats contradict a scale of the microscope that is not fitted.
 
     A fit uses offsets that are far larger than their noise. Of smaller ones, the noise of encoders
     reduces the scale and that of detections increases it: they give limits.
@@ -470,23 +467,17 @@ def _scale_findings(
         or fitted
         or any(traits_of(cause.name).of_microscope for cause in causes)
     ):
-        return []
-    response = contradicted_scale(measurements, u)
-    return (
-        []
-        if response is None
-        else [
-            ScaleOfOffsets(
-                size=-response.slope,
-                u=response.u_slope,
-                unit="m/m",
-                p=response.p,
-                axis=response.axis,
-                most=response.most,
-                u_scale=u,
-            )
-        ]
-    )
+        return
+    if (response := contradicted_scale(measurements, u)) is not None:
+        yield ScaleOfOffsets(
+            size=-response.slope,
+            u=response.u_slope,
+            unit="m/m",
+            p=response.p,
+            axis=response.axis,
+            most=response.most,
+            u_scale=u,
+        )
 
 
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
@@ -497,36 +488,32 @@ def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
         return None
 
 
-def _noise_findings(solved: Solved) -> list[Finding]:
-    out: list[Finding] = [
-        NoiseContradicted(
-            size=noise.residuals,
-            unit=unit,
-            p=noise.p,
-            stated=noise.stated,
-            declared=bool(np.isfinite(noise.declared)),
-        )
-        for noise, unit in ((solved.xy, "m"), (solved.theta, "rad"))
-        if noise.contradicted
-    ]
-    return out if np.isfinite(solved.xy.sigma) else [*out, NoiseUnknown()]
+def _noise_findings(solved: Solved) -> Iterator[Finding]:
+    for noise, unit in ((solved.xy, "m"), (solved.theta, "rad")):
+        if noise.contradicted:
+            yield NoiseContradicted(
+                size=noise.residuals,
+                unit=unit,
+                p=noise.p,
+                stated=noise.stated,
+                declared=bool(np.isfinite(noise.declared)),
+            )
+    if not np.isfinite(solved.xy.sigma):
+        yield NoiseUnknown()
 
 
-def _visits_findings(solved: Solved) -> list[Finding]:
-    """Return a finding if all repeats of each mark belong to one visit."""
+def _visits_findings(solved: Solved) -> Iterator[Finding]:
+    """Yield a finding if all repeats of each mark belong to one visit."""
     if solved.model is None:
-        return []
+        return
     problem = solved.model.problem
     time_fitted = any(term.block.of_time for term in problem.terms)
     visits = [view for view in problem.inputs.visits if view is not None]
     visited_once = len(visits) == len(problem.inputs.visits) and not any(
         v.repeated for v in visits
     )
-    return (
-        [VisitedOnce()]
-        if visited_once and not time_fitted and problem.repeats_xy[1] > 0
-        else []
-    )
+    if visited_once and not time_fitted and problem.repeats_xy[1] > 0:
+        yield VisitedOnce()
 
 
 def views_findings(measurements: Measurements) -> Iterator[Finding]:
