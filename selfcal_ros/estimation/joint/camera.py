@@ -6,7 +6,7 @@ straightens offsets between them; its degree is the smallest that the cells do n
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -386,8 +386,8 @@ def straight_slope(camera: Distortion, place: complex) -> np.ndarray:
 
 def few_read(
     measurements: Measurements, camera: FittedCamera | None
-) -> tuple[Finding, ...]:
-    """Return a finding on the cells of images whose mark is missing in most images.
+) -> Iterator[Finding]:
+    """Yield a finding on the cells of images whose mark is missing in most images.
 
     Those of all views together, or of one.
     """
@@ -408,7 +408,7 @@ def few_read(
             if count[0] < DETERMINED * count[1]
         ]
     if not few:
-        return ()
+        return
     unknown = (
         None
         if camera is None
@@ -418,7 +418,7 @@ def few_read(
         FewReadCell(view=name, cell=cell, read=int(n_read), shown=int(n_shown))
         for name, cell, (n_read, n_shown) in few
     )
-    return (FewRead(unknown=unknown, cells=cells),)
+    yield FewRead(unknown=unknown, cells=cells)
 
 
 def _read_and_shown(

@@ -9,7 +9,7 @@ that term were known, or to the free terms together.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -598,38 +598,30 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | No
 
 def _magnification(
     plate_map: ArtifactMap, of_map: float, options: Options
-) -> tuple[Finding, ...]:
-    """Return whether plate or reference and encoders differ in scale by more than is plausible.
+) -> Iterator[Finding]:
+    """Yield a finding if plate or reference and encoders differ in scale by more than is plausible.
 
     `of_map` is the scale that a reference length gives the map, m/m.
     """
     limit = options.magnification_limit
-    if options.reference is not None:
-        if abs(of_map) <= limit:
-            return ()
+    if options.reference is None:
+        scale, u = plate_map.magnification, plate_map.u_magnification
+        if abs(scale) > limit:
+            yield Magnification(size=scale, u=u, unit="m/m")
+    elif not abs(of_map) <= limit:
         u = options.reference.u_relative
-        return (ReferenceOff(size=of_map, u=u, unit="m/m"),)
-    if not abs(plate_map.magnification) > limit:
-        return ()
-    return (
-        Magnification(
-            size=plate_map.magnification, u=plate_map.u_magnification, unit="m/m"
-        ),
-    )
+        yield ReferenceOff(size=of_map, u=u, unit="m/m")
 
 
-def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
-    """Return the sites and lines of the map, stage frame, that only single readings determine."""
+def _unchecked(system: NormalEquations, sense: Sense) -> Iterator[Finding]:
+    """Yield the sites and lines of the map, stage frame, that only single readings determine."""
     unchecked = turned_over(sense, system.unchecked_sites, sign=1)
     sites = np.argwhere(unchecked) - np.array(unchecked.shape) // 2
     lines = np.argwhere(lines_turned_over(sense, system.unchecked_lines, sign=1))
-    if not len(sites) and not len(lines):
-        return ()
-    return (
-        Unchecked(
+    if len(sites) or len(lines):
+        yield Unchecked(
             sites=tuple(map(tuple, sites.tolist())), lines=tuple(lines[:, 0].tolist())
-        ),
-    )
+        )
 
 
 def weights_read(problem: Problem, index: int) -> dict[str, Any]:

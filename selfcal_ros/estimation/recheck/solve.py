@@ -250,7 +250,7 @@ def recheck(
         passes=min(view.view.repeats for view in measurements.views),
     )
     declared = {term.name for term in options.terms}
-    changes = _changes(outcome)
+    changes = tuple(_changes(outcome))
     failed = _failed(solved, outcome, changes, drift_declared="drift" in declared)
     covers = {
         "xy": np.sum(list(solved.covariances.values()), axis=0),
@@ -327,7 +327,7 @@ def _failed(
         failed = _by_marks(solved, changes[0])
     if not failed and outcome.passes == 1 and not drift_declared:
         failed = (ChangedOrDrifted(**vars(changes[0])),)
-    return failed + _by_microscope(solved, outcome, changes[0])
+    return (*failed, *_by_microscope(solved, outcome, changes[0]))
 
 
 def _by_marks(solved: Rechecked, changed: Changed) -> tuple[Finding, ...]:
@@ -341,13 +341,11 @@ def _by_marks(solved: Rechecked, changed: Changed) -> tuple[Finding, ...]:
     return (ChangedOrMarks(**data),)
 
 
-def _changes(outcome: Recheck) -> tuple[Changed, ...]:
-    """Return the change of the map, if there is one."""
-    if not outcome.changed:
-        return ()
+def _changes(outcome: Recheck) -> Iterator[Changed]:
+    """Yield the change of the map, if there is one."""
     largest = outcome.largest
-    return (
-        Changed(
+    if outcome.changed:
+        yield Changed(
             size=largest.change,
             u=largest.u,
             unit="m",
@@ -356,49 +354,42 @@ def _changes(outcome: Recheck) -> tuple[Changed, ...]:
             x=largest.x,
             y=largest.y,
             of=outcome.of,
-        ),
-    )
+        )
 
 
-def _scale_changes(outcome: Recheck) -> tuple[ScaleChanged, ...]:
-    """Return the change of the scale, which is not part of the map, if there is one."""
+def _scale_changes(outcome: Recheck) -> Iterator[ScaleChanged]:
+    """Yield the change of the scale, which is not part of the map, if there is one."""
     scale = outcome.scale
-    if not scale.changed:
-        return ()
-    return (
-        ScaleChanged(
+    if scale.changed:
+        yield ScaleChanged(
             size=scale.change,
             u=scale.u,
             unit="m/m",
             p=scale.p,
             passes=outcome.passes,
             of=outcome.of,
-        ),
-    )
+        )
 
 
-def _off(solved: Rechecked) -> tuple[Finding, ...]:
-    """Return a finding if visits show another microscope than is assumed."""
+def _off(solved: Rechecked) -> Iterator[Finding]:
+    """Yield a finding if visits show another microscope than is assumed."""
     term = next(
         (term for term in solved.readings.problem.terms if term.block.of_microscope),
         None,
     )
     if solved.microscope is None or term is None:
-        return ()
+        return
     values = solved.microscope.values
     u = np.sqrt(solved.microscope.covariance.diagonal())
     sizes = [term.size_of(component) for component in SIMILAR]
-    if (np.abs(values[:2]) <= BEYOND * np.array(sizes)).all():
-        return ()
-    return (
-        MicroscopeOff(
+    if (np.abs(values[:2]) > BEYOND * np.array(sizes)).any():
+        yield MicroscopeOff(
             size=float(values[0]),
             u=float(u[0]),
             unit="m/m",
             turn=float(values[1]),
             u_turn=float(u[1]),
-        ),
-    )
+        )
 
 
 SIMILAR = ("scale", "turn")
@@ -407,8 +398,8 @@ SIMILAR = ("scale", "turn")
 
 def _by_microscope(
     solved: Rechecked, outcome: Recheck, changed: Changed
-) -> tuple[Finding, ...]:
-    """Return a finding if another microscope explains a change as well as a changed stage does.
+) -> Iterator[Finding]:
+    """Yield a finding if another microscope explains a change as well as a changed stage does.
 
     Its scale and its turn may be any, if neither visits of one mark at several places nor the model
     tells them: then nothing of the change of XY is left beyond its uncertainty, and they differ
@@ -424,23 +415,21 @@ def _by_microscope(
     ]
     of_lines = outcome.p_theta is not None and 2 * outcome.p_theta < USUAL_LEVEL
     if not rows or of_lines or readings.shows_microscope:
-        return ()
+        return
     explained_by = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
     if (
         min(explained_by.p_left, 1.0) < USUAL_LEVEL
         or explained_by.p_none >= USUAL_LEVEL
     ):
-        return ()
+        return
     scale, turn = readings.effects.mean[rows] + explained_by.values
     u_scale, u_turn = explained_by.u
-    return (
-        ChangedOrMicroscope(
-            **vars(changed),
-            scale=float(scale),
-            u_scale=float(u_scale),
-            turn=float(turn),
-            u_turn=float(u_turn),
-        ),
+    yield ChangedOrMicroscope(
+        **vars(changed),
+        scale=float(scale),
+        u_scale=float(u_scale),
+        turn=float(turn),
+        u_turn=float(u_turn),
     )
 
 
