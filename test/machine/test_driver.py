@@ -251,6 +251,6 @@ def test_a_class_of_ones_own_tells_the_same_without_ros_and_by_the_driver(tmp_pa
     finally:
         driver.close()
     assert driven == alone
-    assert len(alone) == 264
+    assert len(alone) == 340
     lines = [line for line, _ in alone if line.kind == Kind.ANGULAR]
     assert {(line.offset_x, line.offset_y) for line in lines} == {(0.0, 0.0)}

@@ -89,7 +89,7 @@ def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
         graph.until(
             lambda: (
                 summaries
-                and summaries[-1].views_done == 4
+                and summaries[-1].views_done == 5
                 and maps
                 and maps[-1].header.stamp == summaries[-1].header.stamp
             ),
@@ -102,7 +102,7 @@ def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
         (status.view_index, status.check_expected, status.check_done)
         for status in statuses
         if status.complete
-    } == {(0, 5, 5), (1, 5, 5), (2, 0, 0), (3, 5, 5)}
+    } == {(0, 5, 5), (1, 5, 5), (2, 0, 0), (3, 5, 5), (4, 5, 5)}
     machine = open_machine(read_cell(tmp_path / "cell.yaml"))
     away, span = away_from(machine, maps[-1].gx, maps[-1].gy, size)
     assert np.abs(away).max() < 2e-8 < 0.1 * span
