@@ -107,6 +107,7 @@ class HuLaw:
         phi0 = (v0[1] * x - v0[0] * y).sum(axis=(0, 1)) / d  # eq. 16
         phi1 = -(v1[0] * x + v1[1] * y).sum(axis=(0, 1)) / d  # eq. 16
         phi2 = vt[2].mean(axis=0) - vt[0].mean(axis=0) + phi0  # eq. 17
+        # Printed with the sum over the lines of view 0 over n, not k.
         phi3 = vt[3].mean(axis=0) - vt[0].mean(axis=0) + phi0  # eq. 17
         u0x, u0y = v0[0] - t0[0] + phi0 * y, v0[1] - t0[1] - phi0 * x  # eq. 18
         u1x, u1y = v1[0] - t1[0] + phi1 * x, v1[1] - t1[1] + phi1 * y  # eq. 19
@@ -133,6 +134,7 @@ class HuLaw:
         f = f.reshape(v0.shape)
         g = np.stack([o * y + r * x + f[0], o * x - r * y + f[1]])  # eq. 6
         phi = np.stack([phi0, phi1, phi2, phi3])
+        # Eqs. 18-21; the last is printed with V3y in place of V3theta.
         g_theta, rest_theta = self._theta(vt - phi[:, None], g)
         a = np.stack([u0x, u0y]) - g  # eq. 18
         t3 = v3 - g[:, 1:] - a[:, :-1] - phi3 * np.stack([-y, x])[:, :-1]  # eq. 15
