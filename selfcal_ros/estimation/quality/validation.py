@@ -379,6 +379,7 @@ def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> tuple[float, c
 
 
 TENTHS = 10
+"""Parts of the readings, of which one is held out: the rest keep nearly all their precision."""
 
 NOTHING = float("nan")
 

@@ -445,6 +445,7 @@ class Candidates:
 
 
 MAX_CAUSES = 4
+"""Largest number of explanations: each is tested beside all before it."""
 
 
 @dataclass(frozen=True, eq=False)
