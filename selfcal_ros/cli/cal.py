@@ -169,43 +169,30 @@ def _check(args: argparse.Namespace) -> int:
     if not 6 <= bits <= 48:
         raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
     cal = read_cal(args.file, gi4=Gi4(bits) if args.gi4 else None)
-    counts = {severity: len(cal.of(severity)) for severity in Severity}
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "file": args.file,
-                    "tables": [_described(table) for table in cal.tables],
-                    **{
-                        f"{severity}s"
-                        if severity is not Severity.TOLERATED
-                        else "tolerated": number
-                        for severity, number in counts.items()
-                    },
-                    "findings": [
-                        {
-                            "line": f.line,
-                            "severity": f.severity,
-                            "what": f.what,
-                            "mend": f.remedy,
-                        }
-                        for f in cal.findings
-                    ],
-                },
-                indent=1,
-            )
-        )
-    else:
-        for finding in cal.findings:
-            tell(finding.text(args.file))
-        for table in cal.tables:
-            tell(f"{args.file}:{table.line}: {_described(table)['text']}")
-        tell(
-            f"{args.file}: {counted(len(cal.tables), 'table')}, "
-            f"{counted(counts[Severity.ERROR], 'error')}, "
-            f"{counted(counts[Severity.WARNING], 'warning')}, "
-            f"{counts[Severity.TOLERATED]} tolerated"
-        )
+    errors, warnings, tolerated = (len(cal.of(severity)) for severity in Severity)
+    tables = [_described(table) for table in cal.tables]
+    lines = [finding.text(args.file) for finding in cal.findings]
+    lines += [f"{args.file}:{table['line']}: {table['text']}" for table in tables]
+    lines.append(
+        f"{args.file}: {counted(len(tables), 'table')}, {counted(errors, 'error')}, "
+        f"{counted(warnings, 'warning')}, {tolerated} tolerated"
+    )
+    findings = [
+        {"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
+        for f in cal.findings
+    ]
+    say(
+        args,
+        "\n".join(lines),
+        {
+            "file": args.file,
+            "tables": tables,
+            "errors": errors,
+            "warnings": warnings,
+            "tolerated": tolerated,
+            "findings": findings,
+        },
+    )
     refuse_errors(cal)
     if args.strict and cal.findings:
         first = cal.findings[0]

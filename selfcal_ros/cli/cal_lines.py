@@ -5,7 +5,6 @@ The latter are ``orthogonality``, ``accuracy`` and ``straightness``.
 """
 
 import argparse
-import json
 import math
 import re
 from collections.abc import Container
@@ -25,7 +24,7 @@ from selfcal_ros.applications.aerotech.export import (
 from selfcal_ros.applications.aerotech.header import SMALLEST, ArgumentFault, number
 from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
+from selfcal_ros.cli.terminal import add_json, exit_code, say
 from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.compensation.plausible import require_plausible
@@ -358,24 +357,18 @@ def _orthogonality(args: argparse.Namespace) -> int:
         ]
         for home, line in line_of.items()
     }
-    if args.json:
-        print(
-            json.dumps(
-                {"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1
-            )
-        )
-        return int(ExitCode.DONE)
-    tell(
+    lines = [
         f"correction of {across} over the full travel of {args.along}: "
         f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm"
-    )
+    ]
     for home, rows in tables.items():
-        tell(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction µm")
-        print(
-            "\n".join(
-                f"  {position:<14.9g} {correction:.9g}" for position, correction in rows
-            )
-        )
+        lines.append(f"{_HOMES[home]} (--home {home})")
+        lines.append(f"  position {args.unit:<5} correction µm")
+        lines += [
+            f"  {position:<14.9g} {correction:.9g}" for position, correction in rows
+        ]
+    data = {"unit": args.unit, "correction_unit": "um", "tables": tables}
+    say(args, "\n".join(lines), data)
     return int(ExitCode.DONE)
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import Any
 
 from selfcal_ros.cli import plan_new, plan_terms
 from selfcal_ros.cli.recheck import planned
-from selfcal_ros.cli.terminal import busy, late_progress, tell
+from selfcal_ros.cli.terminal import busy, late_progress, put, say, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import KNOWN
 from selfcal_ros.estimation.observability.plan_check import (
@@ -191,7 +190,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
                     "max_u_xy_um_with_terms": joint.max_xy * unit,
                 }
         summary["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
-        print(json.dumps(summary | {"terms": plan_terms.terms_json(checks)}, indent=1))
+        put(summary | {"terms": plan_terms.terms_json(checks)})
     else:
         lines = _check_text(plan, (observability, checked.unknown_sites), alone)
         if alone is not None and args.sigma is not None:
@@ -542,40 +541,33 @@ def _show_ranked(
 ) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
     unit = now[1]
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "plan_id": plan.plan_id,
-                    "criterion": args.criterion,
-                    "now": _score_json(*now),
-                    "suggestions": [
-                        {
-                            "text": step_text(item, plan),
-                            "view": item.view
-                            and view_to_dict(item.view, plan.artifact),
-                            "repeat_of": item.repeat_of,
-                            "visit_order": item.order or None,
-                            **_score_json(item.score, unit),
-                        }
-                        for item in ranked
-                    ],
-                },
-                indent=1,
-            )
-        )
-        return
-    tell(
-        "\n".join(
-            [
-                f"plan {plan.plan_id}: {_score_text(*now)}",
-                f"next steps, best first ({args.criterion} uncertainty of XY):",
-                *(
-                    f"  {_score_text(item.score, unit)}   {step_text(item, plan)}"
-                    for item in ranked
-                ),
-            ]
-        )
+    lines = [
+        f"plan {plan.plan_id}: {_score_text(*now)}",
+        f"next steps, best first ({args.criterion} uncertainty of XY):",
+    ]
+    lines += [
+        f"  {_score_text(item.score, unit)}   {step_text(item, plan)}"
+        for item in ranked
+    ]
+    suggestions = [
+        {
+            "text": step_text(item, plan),
+            "view": item.view and view_to_dict(item.view, plan.artifact),
+            "repeat_of": item.repeat_of,
+            "visit_order": item.order or None,
+            **_score_json(item.score, unit),
+        }
+        for item in ranked
+    ]
+    say(
+        args,
+        "\n".join(lines),
+        {
+            "plan_id": plan.plan_id,
+            "criterion": args.criterion,
+            "now": _score_json(*now),
+            "suggestions": suggestions,
+        },
     )
 
 
@@ -586,30 +578,26 @@ def _show_best(
     how: str,
 ) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "plan_id": best.plan_id,
-                    "criterion": args.criterion,
-                    "views": views,
-                    "how": how,
-                    **_score_json(*score),
-                },
-                indent=1,
-            )
-        )
-        return
-    tell(
+    lines = [
         f"best plan of {len(views)} views ({args.criterion} uncertainty of XY; {how}):"
-    )
+    ]
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
-        tell(
+        lines.append(
             f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a:g}, {b:g}]{kind}"
         )
-    tell(_score_text(*score))
+    say(
+        args,
+        "\n".join([*lines, _score_text(*score)]),
+        {
+            "plan_id": best.plan_id,
+            "criterion": args.criterion,
+            "views": views,
+            "how": how,
+            **_score_json(*score),
+        },
+    )
 
 
 def _score_json(score: PlanScore, noise_m: float | None) -> dict[str, Any]:

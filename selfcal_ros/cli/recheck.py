@@ -2,11 +2,10 @@
 """``selfcal recheck``: one view of a calibrated plate, and whether the stage has changed."""
 
 import argparse
-import json
 from pathlib import Path
 
 from selfcal_ros.cli import solve
-from selfcal_ros.cli.terminal import busy, tell
+from selfcal_ros.cli.terminal import busy, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import predict_recheck
@@ -34,23 +33,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _awaited(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what can be said before the plate is calibrated."""
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "plan_id": plan.plan_id,
-                    "identifiable": None,
-                    "artifact_from": plan.artifact_from,
-                    "predicted": None,
-                },
-                indent=1,
-            )
-        )
-        return int(ExitCode.DONE)
-    tell(
+    say(
+        args,
         f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of a plate that a calibration "
         f"makes known\n{plan.artifact_from} is not there yet: `selfcal solve BAG -o FILE` writes "
-        "it;\nwhat the view will show is predicted from it"
+        "it;\nwhat the view will show is predicted from it",
+        {
+            "plan_id": plan.plan_id,
+            "identifiable": None,
+            "artifact_from": plan.artifact_from,
+            "predicted": None,
+        },
     )
     return int(ExitCode.DONE)
 
@@ -68,50 +61,35 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
         prediction = predict_recheck(plan, plate)
-    if args.json:
-        print(
-            json.dumps(
-                plain(
-                    {
-                        "plan_id": plan.plan_id,
-                        "identifiable": True,
-                        "artifact_from": plan.artifact_from,
-                        "unknown_sites": prediction.map.n_unknown,
-                        "predicted": {
-                            "rms_gain_xy": prediction.map.rms_xy,
-                            "max_gain_xy": prediction.map.max_xy,
-                            "rms_gain_theta": prediction.map.rms_theta,
-                            "rms_gain_change": prediction.change,
-                        },
-                    }
-                ),
-                indent=1,
-            )
+    of_map = prediction.map
+    lines = [
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the "
+        f"plate calibrated in {plan.artifact_from}"
+    ]
+    if of_map.n_unknown:
+        lines.append(
+            f"{of_map.n_unknown} of {of_map.u_xy[0].size} nodes of the map remain unknown"
         )
-        return int(ExitCode.DONE)
-    tell(
-        "\n".join(
-            [
-                f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the "
-                f"plate calibrated in {plan.artifact_from}",
-                *(
-                    [
-                        f"{prediction.map.n_unknown} of {prediction.map.u_xy[0].size} nodes of the "
-                        "map remain unknown"
-                    ]
-                    if prediction.map.n_unknown
-                    else []
-                ),
-                "predicted standard uncertainty, in units of the noise of one averaged reading:",
-                f"  XY     rms {prediction.map.rms_xy:.4f}   largest {prediction.map.max_xy:.4f}",
-                *(
-                    [f"  theta  rms {prediction.map.rms_theta:.4f}"]
-                    if len(prediction.map.u_theta)
-                    else []
-                ),
-                f"  change of XY since the calibration: rms {prediction.change:.4f}",
-                *([ONE_PASS] if min(view.repeats for view in plan.views) == 1 else []),
-            ]
-        )
-    )
+    lines += [
+        "predicted standard uncertainty, in units of the noise of one averaged reading:",
+        f"  XY     rms {of_map.rms_xy:.4f}   largest {of_map.max_xy:.4f}",
+    ]
+    if len(of_map.u_theta):
+        lines.append(f"  theta  rms {of_map.rms_theta:.4f}")
+    lines.append(f"  change of XY since the calibration: rms {prediction.change:.4f}")
+    if min(view.repeats for view in plan.views) == 1:
+        lines.append(ONE_PASS)
+    data = {
+        "plan_id": plan.plan_id,
+        "identifiable": True,
+        "artifact_from": plan.artifact_from,
+        "unknown_sites": of_map.n_unknown,
+        "predicted": {
+            "rms_gain_xy": of_map.rms_xy,
+            "max_gain_xy": of_map.max_xy,
+            "rms_gain_theta": of_map.rms_theta,
+            "rms_gain_change": prediction.change,
+        },
+    }
+    say(args, "\n".join(lines), plain(data))
     return int(ExitCode.DONE)
