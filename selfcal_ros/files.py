@@ -291,6 +291,19 @@ def _decoded(raw: bytes, path: str | os.PathLike) -> str:
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 
+def csv_rows(text: str, where: str) -> list[tuple[str, list[str]]]:
+    """Return the place and the cells of each row of a table, as `csv_cells`.
+
+    Rows without content, and those that begin with ``#``, are left out.
+    """
+    places = (
+        (f"{where}:{number}", line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip(", ") and not line.lstrip().startswith("#")
+    )
+    return [(place, csv_cells(line, place)) for place, line in places]
+
+
 def csv_cells(line: str, where: str) -> list[str]:
     """Return the cells of a line of a table.
 

@@ -22,7 +22,7 @@ from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, NoDataError, known_are
-from selfcal_ros.files import csv_cells, read_bytes, read_text
+from selfcal_ros.files import csv_rows, read_bytes, read_text
 from selfcal_ros.model.view import Plan
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.topics import (
@@ -77,13 +77,8 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     NoDataError
         If there are no rows.
     """
-    text = read_text(path)
-    lines = [
-        (f"{path}:{number}", line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.startswith("#")
-    ]
-    heading = csv_cells(lines[0][1], lines[0][0]) if lines else []
+    lines = csv_rows(read_text(path), str(path))
+    heading = lines[0][1] if lines else []
     columns = [column for column in COLUMNS if plan or column != "view"]
     columns += [TIME] if TIME in heading else []
     for column in columns:
@@ -100,8 +95,8 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
     first: dict[str, str] = {}
-    for where, line in lines[1:]:
-        cells = dict(zip(heading, csv_cells(line, where), strict=False))
+    for where, texts in lines[1:]:
+        cells = dict(zip(heading, texts, strict=False))
         if not all(cells.get(column) for column in columns):
             raise InputError(where, "an empty cell", f"give {', '.join(columns)}")
         view = cells["view"] if plan else ""

@@ -11,7 +11,7 @@ from selfcal_ros.cli.deliver import deliver
 from selfcal_ros.cli.terminal import add_json, file_of, tell
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import csv_cells, read_text
+from selfcal_ros.files import csv_rows, read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.plain_numbers import number_of
@@ -163,11 +163,7 @@ def read_points(text: str, where: str) -> np.ndarray:
     InputError
         For another header, or a line that is not as many finite numbers.
     """
-    rows = [
-        (number, csv_cells(line, f"{where}:{number}"))
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip(", ")
-    ]
+    rows = csv_rows(text, where)
     head = [cell.lower() for cell in rows[0][1]] if rows else []
     if tuple(head) not in (AXES, AXES[:2], ENDS):
         raise InputError(
@@ -176,7 +172,7 @@ def read_points(text: str, where: str) -> np.ndarray:
             "name the columns; positions in m and rad",
         )
     points = np.empty((len(rows) - 1, len(head)))
-    for index, (number, cells) in enumerate(rows[1:]):
+    for index, (place, cells) in enumerate(rows[1:]):
         try:
             points[index] = (
                 list(map(number_of, cells)) if len(cells) == len(head) else np.nan
@@ -186,7 +182,7 @@ def read_points(text: str, where: str) -> np.ndarray:
         if not np.abs(points[index]).max() < 1e12:
             hint = "with decimal points, " * (len(cells) == 2 * len(head))
             raise InputError(
-                f"{where}:{number}",
+                place,
                 f"not {len(head)} positions: '{','.join(cells):.60}'",
                 f"give {','.join(head)} {hint}in m and rad",
             )

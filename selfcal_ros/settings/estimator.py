@@ -6,7 +6,7 @@ from typing import Any
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import csv_cells, read_text, read_yaml
+from selfcal_ros.files import csv_rows, read_text, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
@@ -96,19 +96,8 @@ def _with_marks(data: object, where: str, folder: Path) -> object:
 
 def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
     """Return the columns id, x and y of a list of marks, m."""
-    lines = [
-        (f"{where}:{number}", line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip(", ") and not line.startswith("#")
-    ]
-    head = (
-        [
-            cell.lower().removesuffix("_m")
-            for cell in csv_cells(lines[0][1], lines[0][0])
-        ]
-        if lines
-        else []
-    )
+    rows = csv_rows(text, where)
+    head = [cell.lower().removesuffix("_m") for cell in rows[0][1]] if rows else []
     missing = [name for name in ("id", "x", "y") if name not in head]
     if missing:
         raise InputError(
@@ -122,8 +111,7 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
             f"{where}:1", f"two columns {twice[0]}", "leave the right one of them"
         )
     columns: dict[str, list[Any]] = {"id": [], "x": [], "y": []}
-    for place, line in lines[1:]:
-        cells = csv_cells(line, place)
+    for place, cells in rows[1:]:
         if len(cells) != len(head):
             raise InputError(
                 place, f"{len(cells)} cells, not {len(head)}", "correct the line"
@@ -141,7 +129,7 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
         columns["id"],
         columns["x"],
         columns["y"],
-        where=[place for place, _ in lines[1:]],
+        where=[place for place, _ in rows[1:]],
     )
     return columns
 

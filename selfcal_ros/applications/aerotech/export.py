@@ -17,7 +17,7 @@ from selfcal_ros.applications.aerotech.model import Table1D, Table2D, Unit, Unit
 from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
 from selfcal_ros.compensation.residual import require_known
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import csv_cells
+from selfcal_ros.files import csv_rows
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_NM, M_PER_UM, RAD_PER_ARCSEC
 
@@ -203,12 +203,7 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     InputError
         For another header, a value that is not a number, or positions that are not equidistant.
     """
-    lines = enumerate(text.splitlines(), 1)
-    rows = [
-        (number, csv_cells(line, f"{where}:{number}"))
-        for number, line in lines
-        if line.strip(", ")
-    ]
+    rows = csv_rows(text, where)
     if not rows or [cell.lower() for cell in rows[0][1]] != ["position", "error"]:
         raise InputError(
             f"{where}:1",
@@ -216,13 +211,11 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
             "name the columns: position in primary units, error in um",
         )
     values = []
-    for number, row in rows[1:]:
+    for place, row in rows[1:]:
         try:
             position, error = (plain_number(cell) for cell in row)
         except (ArgumentFault, ValueError):
-            raise InputError(
-                f"{where}:{number}", "not two numbers", "give position,error"
-            ) from None
+            raise InputError(place, "not two numbers", "give position,error") from None
         values.append((position * unit_m, -error * M_PER_UM))
     if len(values) < 2:
         raise InputError(

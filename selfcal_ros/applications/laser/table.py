@@ -19,7 +19,7 @@ import numpy as np
 from selfcal_ros.applications.laser import data as laser_data
 from selfcal_ros.applications.laser.profiles import name_of
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.files import csv_cells, read_text
+from selfcal_ros.files import csv_rows, read_text
 from selfcal_ros.outputs import write_text
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.units import M_PER_MM
@@ -73,7 +73,7 @@ def read_table(
         If the table has no rows.
     """
     rows = _rows(path)
-    header = _header(path, rows, columns)
+    header = _header(*rows[0], columns)
     known_columns = {BLOCK, *columns.readings, *columns.errors}
     known_columns |= {name_of(j, j) for j in range(3)}
     known_columns |= {
@@ -85,20 +85,20 @@ def read_table(
     ignored = [name for name in header if name not in known_columns]
     warnings = [f"{path}: column '{name}' is not used" for name in ignored]
     cells: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    first_line: dict[int, int] = {}
-    for line, row in rows[1:]:
+    first_place: dict[int, str] = {}
+    for place, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(
-                f"{path}:{line}",
+                place,
                 f"{len(row)} cells where the header has {len(header)}",
                 "correct the line",
             )
         named = dict(zip(header, row, strict=True))
-        block = _block(named[BLOCK], f"{path}:{line}: {BLOCK}")
-        cells.setdefault(block, []).append(_values(named, columns, f"{path}:{line}"))
-        first_line.setdefault(block, line)
-    for block, line in first_line.items():
-        _refuse_unread(cells[block], columns, f"{path}:{line}")
+        block = _block(named[BLOCK], f"{place}: {BLOCK}")
+        cells.setdefault(block, []).append(_values(named, columns, place))
+        first_place.setdefault(block, place)
+    for block, place in first_place.items():
+        _refuse_unread(cells[block], columns, place)
     return _assemble(_in_order(cells, path), columns), warnings
 
 
@@ -108,20 +108,12 @@ def dimension_of(path: str | os.PathLike) -> int:
     return 3 if any(f"rx_{name}" in header for name in laser_data.DIAGONALS[3]) else 2
 
 
-def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
-    lines = read_text(path).splitlines()
-    filled_lines = [
-        (number, line)
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not filled_lines:
+def _rows(path: str | os.PathLike) -> list[tuple[str, list[str]]]:
+    rows = csv_rows(read_text(path), str(path))
+    if not rows:
         raise NoDataError(
             str(path), "the table is empty", "give a header and one row per block"
         )
-    rows = [
-        (number, csv_cells(line, f"{path}:{number}")) for number, line in filled_lines
-    ]
     if len(rows) == 1:
         raise NoDataError(
             str(path), "the table has a header only", "give one row per block"
@@ -129,9 +121,7 @@ def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _header(path: str | os.PathLike, rows: list, columns: RequiredColumns) -> list[str]:
-    line, header = rows[0]
-    where = f"{path}:{line}"
+def _header(where: str, header: list[str], columns: RequiredColumns) -> list[str]:
     for name in header:
         if header.count(name) > 1:
             raise InputError(where, f"the column '{name}' appears twice", "keep one")
