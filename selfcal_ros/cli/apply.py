@@ -2,13 +2,12 @@
 """``selfcal apply``: commands for true positions, or true positions of indicated ones."""
 
 import argparse
-import sys
 
 import numpy as np
 
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.cli.deliver import deliver
-from selfcal_ros.cli.terminal import add_json, file_of, tell
+from selfcal_ros.cli.terminal import add_json, file_of, warn
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import csv_rows, read_text
@@ -81,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
     edge = args.outside == "edge"
     refuse_other_unit(stage, points, args.points)
     table = distances if points.shape[1] == len(ENDS) else corrected
-    text, unknown, outside = table(stage, points, inverse=args.inverse, edge=edge)
-    _say_better(stage, points)
+    text, unknown, outside = table(args, stage, points)
+    _say_better(args, stage, points)
     treatment = (
         "corrected as the nearest point of its edge, where u is not known"
         if edge
@@ -93,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         (unknown, "next to unknown sites or lines, left empty"),
     ):
         if count:
-            print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
+            warn(args, f"points {what}: {count}")
     code = deliver(
         args,
         stage.result,
@@ -134,7 +133,7 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
     )
 
 
-def _say_better(stage: StageMap, points: np.ndarray) -> None:
+def _say_better(args: argparse.Namespace, stage: StageMap, points: np.ndarray) -> None:
     """Recommend bicubic interpolation if it at least halves u between the nodes."""
     emap = stage.error_map
     used = rms(stage.halfway)
@@ -148,10 +147,10 @@ def _say_better(stage: StageMap, points: np.ndarray) -> None:
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:
-        tell(
-            "selfcal apply: between the nodes u is mostly that of bilinear interpolation, "
+        warn(
+            args,
+            "between the nodes u is mostly that of bilinear interpolation, "
             f"{used * UM_PER_M:.2g} µm halfway; with --method bicubic {cubic * UM_PER_M:.2g} µm",
-            sys.stderr,
         )
 
 
@@ -198,12 +197,13 @@ def read_points(text: str, where: str) -> np.ndarray:
 
 
 def corrected(
-    stage: StageMap, points: np.ndarray, *, inverse: bool, edge: bool
+    args: argparse.Namespace, stage: StageMap, points: np.ndarray
 ) -> tuple[str, int, int]:
     """Return the table of corrected points, and how many are unknown and outside the field.
 
-    Those outside are left empty, or with `edge` corrected as the nearest point of the field.
+    Those outside are left empty, or corrected as the nearest point of the field.
     """
+    inverse = args.inverse
     names = AXES[: points.shape[1]]
     what = "true" if inverse else "command"
     x, y, *theta = points.T
@@ -218,7 +218,7 @@ def corrected(
         )
         u.append(stage.uncertainty_theta(corrected_axes[2] if inverse else theta[0]))
     unknown = int((np.isnan(corrected_axes).any(axis=0) & ~outside).sum())
-    if not edge:
+    if args.outside != "edge":
         corrected_axes[:2] = (
             np.where(outside, np.nan, axis) for axis in corrected_axes[:2]
         )
@@ -235,24 +235,24 @@ def corrected(
 
 
 def distances(
-    stage: StageMap, points: np.ndarray, *, inverse: bool, edge: bool
+    args: argparse.Namespace, stage: StageMap, points: np.ndarray
 ) -> tuple[str, int, int]:
     """Return the table of distances with their errors, as `corrected`; and a line over length."""
-    if inverse:
+    if args.inverse:
         raise InputError(
             "--inverse", "the ends of distances are true positions", "leave it out"
         )
     x1, y1, x2, y2 = points.T
     error, u = stage.length_error((x1, y1), (x2, y2))
     outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
-    if not edge:
+    if args.outside != "edge":
         error = np.where(outside, np.nan, error)
     for where, anywhere in (("anywhere in the field", True), ("of two nodes", False)):
         a, b = stage.length_uncertainty(anywhere=anywhere)
-        tell(
-            f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} µm + "
+        warn(
+            args,
+            f"U of a distance L {where} is at most {a * UM_PER_M:.3g} µm + "
             f"{b * UM_PER_M:.3g} µm/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
-            sys.stderr,
         )
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
     unknown = int((np.isnan(error) & ~outside).sum())

@@ -4,7 +4,6 @@
 import argparse
 import json
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.applications.controllers.export import place_to_look
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, tell
+from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.plausible import require_plausible
@@ -379,10 +378,10 @@ def _export(args: argparse.Namespace) -> int:
         {"files": files, "filled": filled, "checklist": list(steps)},
     )
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
-        print(
-            "selfcal cal: the theta table covers one turn either way and does not roll over;"
-            f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over",
-            file=sys.stderr,
+        warn(
+            args,
+            "the theta table covers one turn either way and does not roll over; "
+            f"--counts-per-unit {frame.theta_axis}=COUNTS makes it roll over",
         )
     return exit_code(result)
 
@@ -419,21 +418,18 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
         error_map, filled = fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)
         if filled:
-            print(
-                f"{args.leaf.prog}: {filled} unknown sites filled from their neighbours",
-                file=sys.stderr,
-            )
+            warn(args, f"{filled} unknown sites filled from their neighbours")
     return result, filled
 
 
 def say_bent(args: argparse.Namespace, bent_m: float) -> None:
     """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
     if bent_m >= LEAST_BEND_M:
-        tell(
-            f"{args.leaf.prog}: --onto: the active table is curved between the nodes of the "
-            f"map by up to {bent_m / M_PER_UM:.3g} µm, which the new table does not reproduce; "
+        warn(
+            args,
+            "--onto: the active table is curved between the nodes of the map by up to "
+            f"{bent_m / M_PER_UM:.3g} µm, which the new table does not reproduce; "
             "calibrate with the nodes of that table, or without it",
-            sys.stderr,
         )
 
 
@@ -488,25 +484,25 @@ def _verify(args: argparse.Namespace) -> int:
             "check signs, axes, unit, home position and encoder directions",
         )
     for part in unfit_parts:
-        tell(
-            f"{args.leaf.prog}: {cal.where}: of {part.name}, which 1D tables can correct, the "
+        warn(
+            args,
+            f"{cal.where}: of {part.name}, which 1D tables can correct, the "
             f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
             f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
             "more than the U of the map: they are not those of this map; check sign, offset, "
             "unit and number of entries, or write them again",
-            sys.stderr,
         )
     unfit = verification.unfit(result.error_map)
     for residual in unfit:
         rms_left, peak_left = (
             size("after") / size("before") for size in (residual.rms, residual.largest)
         )
-        tell(
-            f"{args.leaf.prog}: {cal.where}: the tables leave {100 * rms_left:.0f} % of the "
+        warn(
+            args,
+            f"{cal.where}: the tables leave {100 * rms_left:.0f} % of the "
             f"error at the {residual.place}, {100 * peak_left:.0f} % of the largest, more than the "
             "U of the map: they are not those of this map; check offset, unit and number of rows, "
             "or export them again",
-            sys.stderr,
         )
     return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)
 

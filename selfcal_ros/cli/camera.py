@@ -3,13 +3,12 @@
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
-from selfcal_ros.cli.terminal import add_json, say, tell
+from selfcal_ros.cli.terminal import add_json, say, warn
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
@@ -102,10 +101,10 @@ def run(args: argparse.Namespace) -> int:
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
     counts = detector.counts
     if counts.empty:
-        tell(
-            f"selfcal camera init: {args.bag}: {counts.empty} of {counts.images} images show no "
-            "mark and are left out",
-            sys.stderr,
+        warn(
+            args,
+            f"{args.bag}: {counts.empty} of {counts.images} images show no mark "
+            "and are left out",
         )
     camera = camera_pose(positions, images, Sense(args.sense))
     require_size(
@@ -169,7 +168,7 @@ def _of_bag(
                     np.array([(mark.offset_x, mark.offset_y) for mark in marks])
                 )
     for line, count in bag.lost.items():
-        tell(f"selfcal camera init: {args.bag}: {count} x {line}", sys.stderr)
+        warn(args, f"{args.bag}: {count} x {line}")
     detector.refuse_nothing(args.bag, SIZE_OPTION)
     if not len(stamps):
         raise NoDataError(

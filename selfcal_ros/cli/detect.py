@@ -2,7 +2,6 @@
 """``selfcal detect``: marks in the images of a bag, written as detections."""
 
 import argparse
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +10,14 @@ from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
-from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
+from selfcal_ros.cli.terminal import (
+    add_json,
+    add_parameters,
+    given,
+    node_settings,
+    say,
+    warn,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import write_bytes
@@ -94,10 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
     for line, count in problems.most_common(SHOWN):
-        print(
-            f"selfcal detect: {args.bag}: {f'{count} x ' if count > 1 else ''}{line}",
-            file=sys.stderr,
-        )
+        warn(args, f"{args.bag}: {f'{count} x ' if count > 1 else ''}{line}")
     counts = detector.counts.values()
     say(
         args,

@@ -2,14 +2,13 @@
 """``selfcal export``: the map of a result as the table of a controller."""
 
 import argparse
-import sys
 
 from selfcal_ros.applications.controllers.export import FORMATS, export, loaded
 from selfcal_ros.applications.controllers.grid import Source, Wiring
 from selfcal_ros.cli.cal import figures_of, numbered, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
+from selfcal_ros.cli.terminal import add_json, exit_code, say, warn
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 
@@ -85,10 +84,7 @@ def run(args: argparse.Namespace) -> int:
     )
     say_bent(args, exported.bent_m)
     if exported.remains:
-        tell(
-            f"selfcal export: {args.format} cannot hold the whole map: {exported.remains}",
-            sys.stderr,
-        )
+        warn(args, f"{args.format} cannot hold the whole map: {exported.remains}")
     backups = replace_files(args, exported.files, [args.result, *(args.onto or ())])
     lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:

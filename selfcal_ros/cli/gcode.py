@@ -3,7 +3,6 @@
 
 import argparse
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
-from selfcal_ros.cli.terminal import add_json, file_of, tell
+from selfcal_ros.cli.terminal import add_json, file_of, warn
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
@@ -127,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     ):
         warnings = []
     for line in warnings:
-        tell(f"selfcal gcode: {args.program}: {line}", sys.stderr)
+        warn(args, f"{args.program}: {line}")
     comments = [*origin_lines(result, command(args)), *warnings]
     return deliver(
         args,

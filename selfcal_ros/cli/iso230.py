@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from selfcal_ros.applications.standards import iso230
 from selfcal_ros.applications.standards.iso230 import AxisFigures, PathFigures
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
+from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Measurements, Sense
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
                 raise
             problems.append(f"{error}; left out")
     for line in problems:
-        print(f"selfcal iso230: {line}", file=sys.stderr)
+        warn(args, line)
     say(args, _text(stage, axes, paths), _json(stage, axes, paths))
     return exit_code(stage.result)
 

@@ -6,6 +6,7 @@ import contextlib
 import math
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TextIO
 
 from selfcal_ros.cli import solve, verify
@@ -90,30 +91,20 @@ def run(args: argparse.Namespace) -> int:
             print(f"selfcal measure: stopped; {bag_state}", file=sys.stderr)
         raise
     desk.end()
+    sense = ["--sense", str(cell.sense)]
     if plan.verify:
-        parser = argparse.ArgumentParser()
-        verify.configure(parser)
-        verifying = parser.parse_args(
-            [plan.verify, str(bag), "--sense", str(cell.sense)]
-        )
-        verifying.json = args.json
-        return verify.run(verifying)
+        return _followed_by(verify, args, [plan.verify, str(bag), *sense])
+    outputs = ["-o", f"{bag}.json", "--report", f"{bag}.html"]
+    return _followed_by(solve, args, [str(bag), *outputs, *sense])
+
+
+def _followed_by(verb: ModuleType, args: argparse.Namespace, words: list[str]) -> int:
+    """Run another verb with `words`, in the name of this one."""
     parser = argparse.ArgumentParser()
-    solve.configure(parser)
-    solving = parser.parse_args(
-        [
-            str(bag),
-            "-o",
-            f"{bag}.json",
-            "--sense",
-            str(cell.sense),
-            "--report",
-            f"{bag}.html",
-        ]
-    )
-    solving.verb = "measure"
-    solving.json = args.json
-    return solve.run(solving)
+    verb.configure(parser)
+    followed = parser.parse_args(words, argparse.Namespace(leaf=args.leaf))
+    followed.json = args.json
+    return verb.run(followed)
 
 
 class Terminal:

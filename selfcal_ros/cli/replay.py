@@ -4,7 +4,6 @@
 import argparse
 import contextlib
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -33,7 +32,7 @@ from selfcal_ros.cli.terminal import (
     progress_bar,
     put,
     show,
-    tell,
+    warn,
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.errors import ExitCode, InputError
@@ -112,10 +111,8 @@ def run(args: argparse.Namespace) -> int:
     detector = detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
     bag = bag_lines(args.bag, settings, args.namespace)
-    for (
-        line
-    ) in bag.faults:  # first: what the nodes say of the readings follows from them
-        tell(f"selfcal replay: {args.bag}: {line}", sys.stderr)
+    for line in bag.faults:  # first: what nodes say of the readings follows from them
+        warn(args, f"{args.bag}: {line}")
     with (
         ended_by_signals(),
         temporary_folder(Path(tempfile.gettempdir())) as folder,
@@ -138,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     lines = rejections(result.rejected, sum(view.used for view in result.views))
     if lines and (detector is not None or not offline(args, args.bag).findings):
         for line in lines:
-            tell(f"selfcal replay: {args.bag}: {line}", sys.stderr)
+            warn(args, f"{args.bag}: {line}")
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
@@ -333,5 +330,5 @@ def _play(
             elif word == "lost":
                 lost.append(tail)
                 if tail not in printed_faults:
-                    tell(f"selfcal replay: {args.bag}: {tail}", sys.stderr)
+                    warn(args, f"{args.bag}: {tail}")
         return session.wait(), lost

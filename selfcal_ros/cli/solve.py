@@ -2,7 +2,6 @@
 """``selfcal solve``: a bag in, the calibrated error map out, without middleware."""
 
 import argparse
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -24,7 +23,7 @@ from selfcal_ros.cli.terminal import (
     progress_bar,
     put,
     show,
-    tell,
+    warn,
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
@@ -299,7 +298,7 @@ def _collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSess
         warnings += rejections(measurements.all_rejected(), used)
     # a clock step is a finding, and noted in the result
     for line in dict.fromkeys(warnings):
-        tell(f"selfcal {args.verb}: {args.bag}: {line}", sys.stderr)
+        warn(args, f"{args.bag}: {line}")
     return session
 
 

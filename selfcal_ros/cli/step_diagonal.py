@@ -3,7 +3,6 @@
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,7 +48,7 @@ from selfcal_ros.applications.laser.table import (
 )
 from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
+from selfcal_ros.cli.terminal import add_json, busy, put, say, tell, warn
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_yaml, sha256_of
@@ -164,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
     result = outcome(identified, data, line=ReferenceLine(args.line), warnings=warnings)
     result["input"] = source
     for warning in result["warnings"]:
-        tell(f"selfcal step-diagonal: warning: {warning}", sys.stderr)
+        warn(args, f"warning: {warning}")
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
@@ -239,7 +238,7 @@ def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> No
     )
     backup = write_cals({args.cal: text}, force=args.force)[args.cal]
     if backup:
-        print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
+        warn(args, f"the old {args.cal} is {backup}")
 
 
 def correction_tables(

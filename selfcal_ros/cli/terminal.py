@@ -117,6 +117,11 @@ def tell(text: str, stream: TextIO | None = None) -> None:
     put_text(lines, stream or sys.stdout)
 
 
+def warn(args: argparse.Namespace, text: str) -> None:
+    """Print a line on stderr, after the name of the verb."""
+    tell(f"{args.leaf.prog}: {text}", sys.stderr)
+
+
 def put_text(text: str, stream: TextIO) -> None:
     """Print text as it is, if the stream can encode it."""
     print(text if can_print_symbols(stream) else to_ascii(text), file=stream)

@@ -2,11 +2,10 @@
 """``selfcal verify``: is the machine better with the correction on, and if not, why not."""
 
 import argparse
-import sys
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.cli import solve
-from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified, tell
+from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified, warn
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.checks.placing import PlacingError
@@ -101,7 +100,7 @@ def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationRe
             progress=lambda count: bar(count, None),
         )
     for line in dict.fromkeys([*findings, *lost]):
-        tell(f"selfcal verify: {args.bag}: {line}", sys.stderr)
+        warn(args, f"{args.bag}: {line}")
     source = bag_input(args.bag)
     if before.input.get("sha256") == source["sha256"]:
         raise InputError(
