@@ -386,18 +386,14 @@ def _content(file: BinaryIO) -> bytes:
 
 def _parsed(content: bytes) -> Summary:
     summary = Summary()
-    offset = 0
-    while offset < len(content):
-        opcode, length = mcap_salvage.HEAD.unpack_from(content, offset)
-        offset += mcap_salvage.HEAD.size
-        body = ReadDataStream(io.BytesIO(content[offset : offset + length]))
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(body)
-            summary.schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(body)
-            summary.channels[channel.id] = channel
-        elif opcode == Opcode.CHUNK_INDEX:
-            summary.chunks.append(ChunkIndex.read(body))
-        offset += length
+    for opcode, body in mcap_salvage.bodies(content):
+        if opcode == Opcode.CHUNK_INDEX:
+            stream = ReadDataStream(io.BytesIO(body))
+            summary.chunks.append(ChunkIndex.read(stream))
+            continue
+        record, _ = mcap_salvage.parsed(opcode, body)
+        if isinstance(record, Schema):
+            summary.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            summary.channels[record.id] = record
     return summary

@@ -243,24 +243,30 @@ def chunk_length(data: bytes | mmap, start: int) -> int:
     return CHUNK_FRONT - HEAD.size + name_length + inside
 
 
+def bodies(data: bytes | mmap, offset: int = 0) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and content of each record from `offset` on, up to the first incomplete one."""
+    while offset + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, offset)
+        start = offset + HEAD.size
+        offset = start + length
+        if offset > len(data):
+            return
+        yield opcode, data[start:offset]
+
+
 def declarations(data: mmap) -> Iterator[Schema | Channel]:
     """Yield the schemas and channels repeated in the summary; nothing without a summary."""
-    offset = (
-        struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)[0]
-        if len(data) >= FOOTER_CONTENT
-        else 0
-    )
-    while 0 < offset <= len(data) - HEAD.size:
-        opcode, length = HEAD.unpack_from(data, offset)
-        offset += HEAD.size
+    if len(data) < FOOTER_CONTENT:
+        return
+    [summary] = struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)
+    for opcode, body in bodies(data, summary) if summary else ():
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             try:
-                record, _ = parsed(opcode, data[offset : offset + length])
+                record, _ = parsed(opcode, body)
             except Exception:  # no summary, or a damaged one
                 return
             if isinstance(record, Schema | Channel):
                 yield record
-        offset += length
 
 
 def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int:
@@ -309,20 +315,14 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
     body = _decompressed_front(name, data[begin : begin + inside], size)
     if crc and len(body) >= size and zlib.crc32(body[:size]) != crc:
         return
-    offset = 0
-    while offset + HEAD.size <= len(body):
-        opcode, length = HEAD.unpack_from(body, offset)
-        offset += HEAD.size
-        if offset + length > len(body):
-            return
+    for opcode, content in bodies(body):
         try:
-            record, _ = parsed(opcode, body[offset : offset + length])
+            record, _ = parsed(opcode, content)
         except Exception:
             # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
             yield record
-        offset += length
 
 
 def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
