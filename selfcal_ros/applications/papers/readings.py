@@ -137,42 +137,16 @@ def _repeatability(sigma: float, repeats: int) -> float:
     return sigma if repeats > 1 else float("nan")
 
 
-def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
+def hu_plan(artifact: Artifact, repeats: int = 1) -> Plan:
     """Return Hu's four views: identity, 90 deg, one line (angular only), one pitch along +X."""
-    line = 2 * np.pi / artifact.angular_count if artifact.angular_count else 0.0
     angular = artifact.angular_count > 0
+    view = View("identity", angular=angular, repeats=repeats)
     views = [
-        View(
-            name="identity",
-            rotation_rad=0.0,
-            translation_m=(0.0, 0.0),
-            grid=True,
-            angular=angular,
-            repeats=repeats,
-        ),
-        View(
-            name="rot90",
-            rotation_rad=np.pi / 2,
-            translation_m=(0.0, 0.0),
-            grid=True,
-            angular=angular,
-            repeats=repeats,
-        ),
-        View(
-            name="line",
-            rotation_rad=line,
-            translation_m=(0.0, 0.0),
-            grid=False,
-            angular=True,
-            repeats=repeats,
-        ),
-        View(
-            name="shift_x",
-            rotation_rad=0.0,
-            translation_m=(artifact.grid_pitch_m, 0.0),
-            grid=True,
-            angular=angular,
-            repeats=repeats,
-        ),
+        view,
+        replace(view, name="rot90", rotation_rad=np.pi / 2),
+        replace(view, name="shift_x", translation_m=(artifact.grid_pitch_m, 0.0)),
     ]
-    return Plan(plan_id, artifact, tuple(v for v in views if v.grid or angular))
+    if angular:
+        line = 2 * np.pi / artifact.angular_count
+        views.insert(2, replace(view, name="line", rotation_rad=line, grid=False))
+    return Plan("hu", artifact, tuple(views))
