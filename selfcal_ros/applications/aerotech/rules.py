@@ -39,12 +39,10 @@ class Gi4:
         return 2.0**self.bits / 64
 
 
-def check_tables(
-    tables: Sequence[Table], findings: CalFindings, *, gi4: Gi4 | None = None
-) -> None:
+def check_tables(tables: Sequence[Table], findings: CalFindings) -> None:
     """Add a finding for every rule broken by the tables of one file."""
     for table in tables:
-        check_table(table, findings, gi4=gi4)
+        check_table(table, findings)
         if table.kind is not tables[0].kind:
             mixed_kinds(table.line, (table.kind, tables[0].kind), findings)
     check_counts(tables, findings)

@@ -153,7 +153,6 @@ def courses(
     days: np.ndarray,
     table: Mapping[str, np.ndarray],
     *,
-    seed: int = SEED,
     orders: int = ORDERS,
 ) -> dict[str, Course]:
     """Return the course of every quantity, with a common decision.
@@ -164,10 +163,10 @@ def courses(
         Times, rising, in days.
     table : mapping
         Quantity -> values (n,), NaN if unknown.
-    seed, orders : int
-        Seed and number of the random orders.
+    orders : int
+        Number of the random orders.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     course_of_quantity = {}
     for name, values in table.items():
         has_value = np.isfinite(values)

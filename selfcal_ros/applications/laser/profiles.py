@@ -104,16 +104,12 @@ def slope(
     return float(row @ result.errors_m[axis, :, direction])
 
 
-def u_slope(
-    result: StepDiagonalResult,
-    axis: int,
-    direction: int,
-    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
-) -> float | None:
-    """Return the standard uncertainty of `slope`; None if unknown."""
+def u_slope(result: StepDiagonalResult, axis: int, direction: int) -> float | None:
+    """Return the standard uncertainty of a least-squares `slope`; None if unknown."""
     if result.covariance is None:
         return None
-    row = _slope_row(result.n_blocks, line) / result.steps_m[axis]
+    row = _slope_row(result.n_blocks, ReferenceLine.LEAST_SQUARES)
+    row = row / result.steps_m[axis]
     block = _block(result, (axis, direction), (axis, direction))
     return float(np.sqrt(max(row @ block @ row, 0.0)))
 
@@ -144,13 +140,10 @@ def squareness(
 
 
 def squareness_rad(
-    result: StepDiagonalResult,
-    first: int = 0,
-    second: int = 1,
-    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+    result: StepDiagonalResult, line: ReferenceLine = ReferenceLine.LEAST_SQUARES
 ) -> float:
-    """Return the squareness as an angle, rad: 90 deg minus the angle between the axes."""
-    return slope(result, second, first, line) + slope(result, first, second, line)
+    """Return the squareness of X and Y as an angle, rad: 90 deg minus that between the axes."""
+    return slope(result, 1, 0, line) + slope(result, 0, 1, line)
 
 
 def axis_pairs(dim: int) -> list[tuple[int, int]]:

@@ -150,7 +150,7 @@ def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.El
             _dcc("performanceLocation", core["place"]),
             _dcc("issueDate", core["issued"]),
         ),
-        _dcc("items", _dcc("item", *_thing(item, "manufacturer"))),
+        _dcc("items", _dcc("item", *_thing(item))),
         _dcc(
             "calibrationLaboratory",
             _dcc_if_given("calibrationLaboratoryCode", lab.get("code")),
@@ -180,7 +180,7 @@ def _identification(issuer: str, value: str, name: str) -> ET.Element:
     )
 
 
-def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
+def _thing(item: dict[str, str]) -> Iterator[ET.Element | None]:
     """Yield the parts of an item or an equipment."""
     yield _content("name", item["name"])
     descriptions = [
@@ -199,7 +199,7 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
     if "serial_number" in item:
         yield _dcc(
             "identifications",
-            _identification(issuer, item["serial_number"], "serial number"),
+            _identification("manufacturer", item["serial_number"], "serial number"),
         )
 
 
@@ -257,8 +257,7 @@ def _results(
         for item in details["conditions"]
     ]
     equipment = [
-        _dcc("measuringEquipment", *_thing(item, "manufacturer"))
-        for item in details["equipment"]
+        _dcc("measuringEquipment", *_thing(item)) for item in details["equipment"]
     ]
     return _dcc(
         "measurementResults",

@@ -337,7 +337,7 @@ def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
         "uncertainty-map", f"Uncertainty of the map, U with k = {k:.3g}"
     )
     frame = _frame(drawing, artifact, [np.zeros((2, 1))])
-    scale = parts.range_scale("v", U_um)
+    scale = parts.range_scale(U_um)
     parts.cells(frame, artifact, U_um, scale)
     frame.axes(x_label="stage x in mm", y_label="stage y in mm")
     left, top, width, height = frame.box
@@ -375,7 +375,7 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
     error_names = [ERRORS[of][0] + axis for axis in "xy"]
     for names, pair, scale in (
         (error_names, errors, parts.Scale("d", -end, end)),
-        ([f"U({name})" for name in error_names], u, parts.range_scale("v", u)),
+        ([f"U({name})" for name in error_names], u, parts.range_scale(u)),
     ):
         for column, (name, values) in enumerate(zip(names, pair, strict=True)):
             box = (left + column * (side + gap), top, side)

@@ -170,8 +170,8 @@ def round_end(values: np.ndarray) -> float:
     return step * math.ceil(largest / step - 1e-9)
 
 
-def range_scale(ramp: str, values: np.ndarray) -> Scale:
-    """Return a scale from the smallest to the largest value, both ends rounded outwards.
+def range_scale(values: np.ndarray) -> Scale:
+    """Return a scale of uncertainties, from the smallest to the largest, rounded outwards.
 
     Its ends are equal if the values agree to 1 %, or if none is known.
     """
@@ -180,10 +180,10 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
         (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     )
     if high - low <= 0.01 * high:
-        return Scale(ramp, high, high)
+        return Scale("v", high, high)
     step = draw.round_step(high - low, 5) / 2
     return Scale(
-        ramp, step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9)
+        "v", step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9)
     )
 
 

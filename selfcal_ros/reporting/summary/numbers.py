@@ -88,20 +88,18 @@ def fixed_column(values: Sequence[float], digits: int = 3) -> list[str]:
     return [fixed(value, decimals) for value in values]
 
 
-def aligned_numbers(
-    values: Sequence[float], digits: int = 3, *, more: int = 3
-) -> list[str]:
+def aligned_numbers(values: Sequence[float]) -> list[str]:
     """Return the values of a column with equal decimals that resolve even the smallest one.
 
-    The largest has `digits` significant digits, and up to `more` decimals are added until the
+    The largest has three significant digits, and up to three decimals are added until the
     smallest has two; values beyond are in scientific form.
     """
     sizes = [abs(v) for v in values if math.isfinite(v) and v != 0]
     if not sizes or max(sizes) >= 1e7 or max(sizes) < 1e-6:
-        return [significant(v, digits) for v in values]
+        return [significant(v) for v in values]
     decimals_of_smallest = 1 - math.floor(math.log10(min(sizes)))
-    base = decimals_for(values, digits)
-    decimals = min(max(base, decimals_of_smallest), base + more)
+    base = decimals_for(values)
+    decimals = min(max(base, decimals_of_smallest), base + 3)
     return [fixed(value, decimals) for value in values]
 
 

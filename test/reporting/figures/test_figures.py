@@ -197,7 +197,7 @@ def test_steps_of_a_scale_to_both_sides(value, step):
     ],
 )
 def test_a_scale_over_a_range_shows_the_variation_unless_there_is_none(values, ends):
-    scale = range_scale("v", np.array(values))
+    scale = range_scale(np.array(values))
     assert (scale.low, scale.high) == pytest.approx(ends)
 
 
