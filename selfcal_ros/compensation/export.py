@@ -17,6 +17,21 @@ from selfcal_ros.outputs import to_ascii
 from selfcal_ros.units import UM_PER_M
 
 
+def tidy(value: float) -> float:
+    """Return `value` without rounding errors from a change of unit."""
+    return float(f"{value:.14g}") + 0.0
+
+
+def plain(value: float) -> str:
+    """Return the shortest decimal number that reads back as `value`, without exponent."""
+    return np.format_float_positional(value, trim="-")
+
+
+def comment_text(text: str) -> str:
+    """Return a text without what is not printable, which could end its line."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
 def fill_unknown(error_map: ErrorMap) -> tuple[ErrorMap, int]:
     """Return the map with each unknown site set to the mean of its neighbours, and their number.
 

@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros.applications.aerotech.header import ArgumentFault
 from selfcal_ros.applications.aerotech.header import number as plain_number
 from selfcal_ros.applications.aerotech.model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.export import tidy
 from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
 from selfcal_ros.compensation.residual import require_known
 from selfcal_ros.errors import InputError
@@ -31,11 +32,6 @@ PRIMARY = Unit(UnitWord.PRIMARY)
 def micrometres(unit_m: float) -> Unit:
     """Return the correction unit for micrometres with a primary unit of `unit_m` m."""
     return Unit(UnitWord.PRIMARY, tidy(unit_m / M_PER_UM))
-
-
-def tidy(value: float) -> float:
-    """Return `value` without rounding errors from a change of unit."""
-    return float(f"{value:.14g}") + 0.0
 
 
 def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:

@@ -20,19 +20,10 @@ from selfcal_ros.applications.aerotech.model import (
 )
 from selfcal_ros.applications.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.applications.aerotech.rules import check_tables
+from selfcal_ros.compensation.export import comment_text, plain
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import has_content, refuse_existing, write_together
-
-
-def decimal(value: float) -> str:
-    """Return the shortest decimal number that reads back as `value`, without exponent."""
-    text = repr(float(value))
-    return (
-        np.format_float_positional(value, trim="-")
-        if "e" in text
-        else text.removesuffix(".0")
-    )
 
 
 def cal_text(
@@ -63,12 +54,12 @@ def cal_text(
     if not tables:
         raise InputError("calibration file", "it has no tables", "give at least one")
     refuse_errors(CalFile("calibration file", tuple(tables), findings.sorted()))
-    lines = [f"; {_printable(comment)}".rstrip() for comment in comments]
+    lines = [f"; {comment_text(comment)}".rstrip() for comment in comments]
     for table in tables:
         lines += _head(table)
         values = table.values.reshape(len(table.values), -1)
         if decimals is None:
-            lines += [" ".join(map(decimal, row)) for row in values.tolist()]
+            lines += [" ".join(map(plain, row)) for row in values.tolist()]
         else:
             row_format = " ".join([f"%.{decimals}f"] * values.shape[1])
             lines += [
@@ -102,10 +93,6 @@ def _refuse_what_reads_differently(
             )
 
 
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
 def _no_minus_zero(values: np.ndarray, decimals: int) -> np.ndarray:
     return np.where(np.abs(values) < 0.5 * 10.0**-decimals, 0.0, values)
 
@@ -119,8 +106,8 @@ def _head(table: Table) -> list[str]:
             str(table.row_axis),
             str(table.column_axis),
             *map(str, table.outputs[:2]),
-            decimal(table.sample_row),
-            decimal(table.sample_col),
+            plain(table.sample_row),
+            plain(table.sample_col),
             str(table.values.shape[1]),
         ]
     lines = [f"{start} {' '.join(arguments)}"]
@@ -140,11 +127,9 @@ def _head(table: Table) -> list[str]:
 def _argument(value: float | int | str | Unit) -> str:
     if isinstance(value, Unit):
         return (
-            value.word
-            if value.divisor == 1
-            else f"{value.word}/{decimal(value.divisor)}"
+            value.word if value.divisor == 1 else f"{value.word}/{plain(value.divisor)}"
         )
-    return decimal(value) if isinstance(value, float) else str(value)
+    return plain(value) if isinstance(value, float) else str(value)
 
 
 def write_cals(

@@ -20,11 +20,11 @@ from selfcal_ros.applications.controllers.grid import (
     lines_of,
     nodes,
     numbers,
-    plain,
     spacing,
     wanted,
 )
 from selfcal_ros.applications.controllers.planes import Texts
+from selfcal_ros.compensation.export import plain
 from selfcal_ros.compensation.residual import Correction
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap

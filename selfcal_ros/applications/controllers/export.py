@@ -23,7 +23,7 @@ from selfcal_ros.applications.controllers.planes import (
     write_kmotion,
     write_pmac,
 )
-from selfcal_ros.compensation.export import provenance
+from selfcal_ros.compensation.export import comment_text, provenance
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import (
     Correction,
@@ -284,8 +284,7 @@ def _plain(text: str) -> str:
 
     Beckhoff's ``/* */`` comments go on over lines.
     """
-    line = "".join(c if c.isprintable() else " " for c in text)
-    return line.replace("*/", "* /").replace("/*", "/ *")
+    return comment_text(text).replace("*/", "* /").replace("/*", "/ *")
 
 
 def checklist(

@@ -11,6 +11,7 @@ import numpy as np
 
 from selfcal_ros.compensation.cells import Interpolation
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.export import tidy
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import Correction, require_known
 from selfcal_ros.errors import InputError
@@ -128,8 +129,7 @@ def nodes(error_map: ErrorMap, frame: MachineFrame) -> tuple[np.ndarray, np.ndar
     """Return the positions of the sites' columns and rows, ascending, controller's coordinates."""
     plate = error_map.artifact
     x, y = frame.to_machine(plate.x_m[:, 0], plate.y_m[0])
-    tidy = np.vectorize(lambda value: float(f"{value:.14g}") + 0.0)
-    return tidy(np.sort(x)), tidy(np.sort(y))
+    return np.array([*map(tidy, np.sort(x))]), np.array([*map(tidy, np.sort(y))])
 
 
 def spacing(positions: np.ndarray) -> float:
@@ -142,11 +142,6 @@ def fixed(value: float, unit_m: float) -> str:
     decimals = max(0, math.ceil(-math.log10(2 * ROUNDING_M / unit_m) - 1e-9))
     text = f"{value:.{decimals}f}"
     return text.removeprefix("-") if float(text) == 0 else text
-
-
-def plain(value: float) -> str:
-    """Return the shortest decimal number that reads back as `value`, without exponent."""
-    return np.format_float_positional(value, trim="-")
 
 
 def lines_of(source: Source, comment: str) -> list[Line]:

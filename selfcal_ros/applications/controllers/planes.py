@@ -22,10 +22,10 @@ from selfcal_ros.applications.controllers.grid import (
     lines_of,
     nodes,
     numbers,
-    plain,
     spacing,
     wanted,
 )
+from selfcal_ros.compensation.export import plain
 from selfcal_ros.compensation.residual import Correction, Covering
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
