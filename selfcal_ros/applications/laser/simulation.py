@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from selfcal_ros.applications.laser.data import (
     DIAGONALS,
@@ -182,19 +183,18 @@ def trace(
             i = block if sign > 0 else machine.n_blocks - 1 - block
             step = sign * vectors[j, i]
             if machine.stacked:
-                step = rotation(carried[:j].sum(axis=0)) @ step
+                step = Rotation.from_rotvec(carried[:j].sum(axis=0)).apply(step)
             carried[j] += sign * turns[j, i]
             order.append(j * machine.n_blocks + i)
             centres.append(centres[-1] + step)
             angles.append(angles[-1] + sign * turns[j, i])
     beam, normal = _directions(machine, signs, setup, centres[-1])
     spot = np.array(setup.abbe_m)
-    distances = []
-    for centre, angle in zip(centres, angles, strict=True):
-        turn = rotation(angle)
-        facing = turn @ normal
-        distances.append((centre + turn @ spot - spot) @ facing / (beam @ facing))
-    return np.array(order), np.array(distances) * (1.0 + setup.scale)
+    turn = Rotation.from_rotvec(angles)
+    facing = turn.apply(normal)
+    travel = centres + turn.apply(spot) - spot
+    distances = np.sum(travel * facing, axis=1) / (facing @ beam)
+    return np.array(order), distances * (1.0 + setup.scale)
 
 
 def _directions(
@@ -218,18 +218,9 @@ def _tilted(
     angles_rad: tuple[float, ...],
 ) -> np.ndarray:
     for side, angle in zip(sideways, angles_rad, strict=False):
-        direction = rotation(angle * np.cross(direction, side)) @ direction
+        turn = Rotation.from_rotvec(angle * np.cross(direction, side))
+        direction = turn.apply(direction)
     return direction
-
-
-def rotation(vector_rad: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a rotation vector (Rodrigues)."""
-    angle = np.linalg.norm(vector_rad)
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector_rad / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def random_machine(

@@ -10,7 +10,6 @@ from selfcal_ros.applications.laser.simulation import (
     SetUp,
     StepMachine,
     random_machine,
-    rotation,
     simulate_step_diagonal,
     trace,
 )
@@ -135,10 +134,3 @@ def test_a_random_machine_is_in_the_datum_of_the_results():
     np.testing.assert_allclose(
         identify_ibaraki(simulate(machine)).errors_m, machine.errors_m, atol=1e-13
     )
-
-
-def test_a_rotation_keeps_lengths_and_turns_counter_clockwise():
-    turn = rotation(np.array([0, 0, np.pi / 2]))
-    np.testing.assert_allclose(turn @ [1, 0, 0], [0, 1, 0], atol=1e-15)
-    turn = rotation(np.array([0.3, -0.2, 0.9]))
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
