@@ -275,11 +275,7 @@ def view_readings(message: Any) -> ViewReadings:
     ):
         names += [u] * (len(table[u]) > 0)
         if len({len(table[name]) for name in names}) > 1:
-            raise InputError(
-                f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                f"{', '.join(names)} differ in length",
-                "correct the publisher",
-            )
+            raise _bad_measurement(message, f"{', '.join(names)} differ in length")
     return ViewReadings(
         view_of(
             message,
@@ -302,16 +298,21 @@ def view_readings(message: Any) -> ViewReadings:
     )
 
 
+def _bad_measurement(message: Any, what: str) -> InputError:
+    """Return the error of a ViewMeasurement that its publisher has to correct."""
+    return InputError(
+        f"{MEASUREMENT_TOPIC} of '{message.view_name}'", what, "correct the publisher"
+    )
+
+
 def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
     """Return the sums over repeats in a ViewMeasurement; None if it has none."""
     products = np.array(getattr(message, name, ()), dtype=float)
     if not len(products):
         return None
     if len(products) != size**2:
-        raise InputError(
-            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-            f"{name} has {len(products)} values, not {size**2}",
-            "correct the publisher",
+        raise _bad_measurement(
+            message, f"{name} has {len(products)} values, not {size**2}"
         )
     return RepeatMotion(
         products.reshape(size, size), int(getattr(message, f"dof_{name}"))
@@ -336,10 +337,8 @@ def _visits_of(message: Any) -> GridVisits | None:
         or table["mark"].min() < 0
         or table["mark"].max() >= len(message.m)
     ):
-        raise InputError(
-            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-            "the visits differ in length or name marks that were not read",
-            "correct the publisher",
+        raise _bad_measurement(
+            message, "the visits differ in length or name marks that were not read"
         )
     return GridVisits(
         **table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit)
@@ -354,10 +353,8 @@ def _places_of(message: Any) -> RejectedPlaces:
     )
     reasons = list(map(str, message.reject_reasons))
     if not len(number) == len(x) == len(y) or (number >= len(reasons)).any():
-        raise InputError(
-            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-            "the rejected detections differ in length or name no reason",
-            "correct the publisher",
+        raise _bad_measurement(
+            message, "the rejected detections differ in length or name no reason"
         )
     return RejectedPlaces(tuple(reasons[index] for index in number), x, y)
 
@@ -368,10 +365,8 @@ def counts(message: Any, prefix: str) -> dict[str, int]:
         getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts")
     )
     if len(reasons) != len(numbers):
-        raise InputError(
-            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-            f"{prefix}_reasons and {prefix}_counts differ in length",
-            "correct the publisher",
+        raise _bad_measurement(
+            message, f"{prefix}_reasons and {prefix}_counts differ in length"
         )
     return {
         str(reason): int(number)
