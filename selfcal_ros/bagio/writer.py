@@ -40,11 +40,7 @@ def new_bag(path: str | Path) -> Iterator[Path]:
         If `path` exists, or cannot be created.
     """
     target = Path(path)
-    if target.exists():
-        raise InputError(
-            str(target), "exists already", "remove it or name another folder"
-        )
-    try:
+    with _creating(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as unfinished:
             try:
@@ -56,9 +52,20 @@ def new_bag(path: str | Path) -> Iterator[Path]:
                 where = error.where.replace(str(unfinished), str(target.parent))
                 raise InputError(where, error.what, error.remedy) from error
             Path(unfinished, target.name).rename(target)
+
+
+@contextmanager
+def _creating(folder: Path) -> Iterator[None]:
+    """Refuse a folder that exists; convert the errors of creating it to an InputError."""
+    try:
+        if folder.exists():
+            raise InputError(
+                str(folder), "exists already", "remove it or name another folder"
+            )
+        yield
     except OSError as error:
         raise InputError(
-            str(target),
+            str(folder),
             f"cannot be created ({error.strerror})",
             "name a writable folder",
         ) from error
@@ -250,18 +257,8 @@ class BagWriter(Closing):
     def __post_init__(self) -> None:
         """Create the folder and start the file."""
         self.path = Path(self.path)
-        try:
+        with _creating(self.path):
             self.path.mkdir(parents=True)
-        except FileExistsError as error:
-            raise InputError(
-                str(self.path), "exists already", "remove it or name another folder"
-            ) from error
-        except OSError as error:
-            raise InputError(
-                str(self.path),
-                f"cannot be created ({error.strerror})",
-                "name a writable folder",
-            ) from error
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])
         with writing(self.path):
