@@ -52,28 +52,25 @@ class Sequencer:
 
     def start(self) -> list[Command]:
         """Begin the plan with its first view."""
-        if self.state not in ENDED:
-            raise InputError(
-                "pose_sequencer",
-                f"cannot start while {self.state}",
-                "abort the plan first",
-            )
-        self.need_plan()
-        self.skipped, self.index = [], 0
+        self._begin("start", 0)
         return self._place()
 
     def resume(self, index: int, phase: Phase) -> Command:
         """Resume a run at the view and the command (PLACE or MEASURE) that it had reached."""
+        self._begin("resume", index)
+        self.state = State.PLACING if phase == Phase.PLACE else State.MEASURING
+        return self._command(phase)
+
+    def _begin(self, request: str, index: int) -> None:
+        """Go to a view of the plan; refuse to do so while another run lasts."""
         if self.state not in ENDED:
             raise InputError(
                 "pose_sequencer",
-                f"cannot resume while {self.state}",
+                f"cannot {request} while {self.state}",
                 "abort the plan first",
             )
         self.need_plan()
         self.skipped, self.index = [], index
-        self.state = State.PLACING if phase == Phase.PLACE else State.MEASURING
-        return self._command(phase)
 
     def need_plan(self) -> Plan:
         """Return the plan to run; raise InputError if there is none."""
@@ -108,22 +105,12 @@ class Sequencer:
 
     def redo(self) -> list[Command]:
         """Place the current view again, superseding its readings."""
-        if self.state not in (State.PLACING, State.MEASURING):
-            raise InputError(
-                "pose_sequencer",
-                f"nothing to redo while {self.state}",
-                "start a plan first",
-            )
+        self._need_view("redo")
         return self._place()
 
     def skip(self) -> list[Command]:
         """Keep the current view as it is and continue with the next."""
-        if self.state not in (State.PLACING, State.MEASURING):
-            raise InputError(
-                "pose_sequencer",
-                f"nothing to skip while {self.state}",
-                "start a plan first",
-            )
+        self._need_view("skip")
         self.skipped.append(self.need_plan().views[self.index].name)
         return self._advance()
 
@@ -136,14 +123,18 @@ class Sequencer:
         if self.state is State.FOLLOWING:
             self.state = State.IDLE
             return []
+        self._need_view("abort")
+        self.state = State.ABORTED
+        return [self._command(Phase.ABORT)]
+
+    def _need_view(self, request: str) -> None:
+        """Refuse a request if no view is being placed or measured."""
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError(
                 "pose_sequencer",
-                f"nothing to abort while {self.state}",
+                f"nothing to {request} while {self.state}",
                 "start a plan first",
             )
-        self.state = State.ABORTED
-        return [self._command(Phase.ABORT)]
 
     def foreign_command(self) -> None:
         """Follow another publisher's command: recorded commands take precedence."""
