@@ -97,16 +97,9 @@ def identify_grid(
     """
     pose = view.on_stage(artifact)
     pitch = artifact.grid_pitch_m
-    reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid:
-        reasons[:] = Reason.NOT_IN_VIEW
-        return MarkAssignment(
-            ids,
-            np.zeros(reading_m.shape),
-            np.zeros(reading_m.shape),
-            reasons,
-            rigids.Rigid(),
-        )
+        return _not_in_view(ids, reading_m)
+    reasons = np.full(reading_m.shape[1], None, dtype=object)
     named_unknown = has_id & ~artifact.has(*ids)
     marks = np.where(
         has_id & ~named_unknown,
@@ -155,6 +148,13 @@ def identify_grid(
         rigid=rigid,
         phi_error_rad=fit.phi_error_rad,
     )
+
+
+def _not_in_view(ids: np.ndarray, reading: np.ndarray) -> MarkAssignment:
+    """Return the rejection of all detections of a kind that the view does not ask for."""
+    reasons = np.full(reading.shape[-1], Reason.NOT_IN_VIEW, dtype=object)
+    nothing = np.zeros(reading.shape)
+    return MarkAssignment(ids, nothing, nothing, reasons, rigids.Rigid())
 
 
 def _identified(
@@ -425,17 +425,10 @@ def identify_angular(
         The view's rotation from the grid marks. If neither they nor ids determine it, and
         the nearest line may be wrong, lines without ids are rejected.
     """
-    reasons = np.full(len(reading_rad), None, dtype=object)
     count = artifact.angular_count
     if not count or not view.angular:
-        reasons[:] = Reason.NOT_IN_VIEW
-        return MarkAssignment(
-            np.zeros(len(ids), int),
-            np.zeros(len(ids)),
-            np.zeros(len(ids)),
-            reasons,
-            rigids.Rigid(),
-        )
+        return _not_in_view(ids, reading_rad)
+    reasons = np.full(len(reading_rad), None, dtype=object)
     step = 2 * np.pi / count
     whole_lines, fraction = divmod(view.on_stage(artifact).s, 1)
     # a turn between two lines only for a Fourier map
