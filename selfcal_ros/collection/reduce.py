@@ -6,7 +6,7 @@ Rejected grid detections are kept with the position of the stage, which may indi
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -259,26 +259,12 @@ class _GridMarks:
         in_cell = self.cell == number
         if in_cell.all():
             return self
-        index, deviation, residual, position, approach = (
-            np.compress(in_cell, values, axis=-1)
-            for values in (
-                self.index,
-                self.deviation,
-                self.residual,
-                self.position,
-                self.approach,
-            )
-        )
-        return _GridMarks(
-            detections=self.detections[in_cell],
-            index=index,
-            deviation=deviation,
-            residual=residual,
-            position=position,
-            approach=approach,
-            phi_rad=self.phi_rad,
-            cell=self.cell[in_cell],
-        )
+        columns: dict[str, Any] = {
+            field.name: np.compress(in_cell, getattr(self, field.name), axis=-1)
+            for field in fields(self)
+            if field.name != "phi_rad"
+        }
+        return replace(self, **columns)
 
 
 def _grid_marks(
