@@ -10,7 +10,7 @@ import io
 import tempfile
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -182,7 +182,7 @@ class SampleStore:
 
     def _close(self) -> None:
         stamps, positions, speeds = self._open()
-        has_speeds = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
+        has_speeds = not np.isnan(speeds).all()
         columns = (stamps, positions, speeds) if has_speeds else (stamps, positions)
         self._blocks.append(
             _Block(int(stamps[0]), int(stamps[-1]), len(stamps), has_speeds, columns)
@@ -220,13 +220,7 @@ class SampleStore:
                 f"({error.strerror})"
             )
             return
-        self._blocks[number] = _Block(
-            block.first_ns,
-            block.last_ns,
-            block.count,
-            block.has_speeds,
-            place=self._end,
-        )
+        self._blocks[number] = replace(block, columns=(), place=self._end)
         self._end += sum(column.nbytes for column in block.columns)
 
     def _columns(self, block: _Block) -> tuple[np.ndarray, ...]:

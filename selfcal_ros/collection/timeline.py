@@ -165,10 +165,7 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     if not measures:
         last = ordered[-1].stamp_ns if ordered else 0
         return Timeline(
-            intervals=tuple(_unused(ordered)),
-            views={},
-            last_stamp_ns=last,
-            strays=strays,
+            intervals=tuple(_unused(ordered)), last_stamp_ns=last, strays=strays
         )
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact

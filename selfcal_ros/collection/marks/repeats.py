@@ -221,9 +221,8 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
     declared = sigma > 0
     if not declared.any():
         return np.ones(len(sigma))
-    return np.where(declared, sigma, np.median(sigma[declared])) / np.median(
-        sigma[declared]
-    )
+    middle = np.median(sigma[declared])
+    return np.where(declared, sigma, middle) / middle
 
 
 def _outliers(

@@ -140,7 +140,7 @@ def texts(poses: Mapping[int, SeenPose]) -> dict[int, str]:
     right = len(wrong) < len(poses)
     other_views = (
         "; other views are as planned: leave the joints and the sense as they are"
-        if (right)
+        if right
         else ""
     )
     exchanged = dict(_exchanged(wrong))
@@ -221,11 +221,7 @@ def _found_pose(
         found_deg=_turn(turn, pose, max_rotation_rad),
         found_shift=_shift(shift, pose),
     )
-    lies_as_planned = (misplaced.found_deg, misplaced.found_shift) == (
-        misplaced.planned_deg,
-        misplaced.planned_shift,
-    )
-    return SeenPose(misplaced, planned=lies_as_planned, mirrored=False)
+    return SeenPose(misplaced, planned=misplaced == as_planned, mirrored=False)
 
 
 def _fitted(
