@@ -152,6 +152,19 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         os.close(fd)
 
 
+@contextlib.contextmanager
+def creating(folder: Path) -> Iterator[None]:
+    """Convert the errors of creating a folder to an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            str(folder),
+            f"cannot be created ({error.strerror})",
+            "name a writable folder",
+        ) from error
+
+
 def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
     """Create a temporary file or folder; return it and the descriptor of its lock."""
     sweep(parent)

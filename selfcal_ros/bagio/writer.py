@@ -23,7 +23,7 @@ from rosbags.typesys.store import Typestore
 from selfcal_ros.bagio.messages.from_model import Fields
 from selfcal_ros.bagio.schemas import definition_of, hash_of, store_with
 from selfcal_ros.errors import InputError
-from selfcal_ros.outputs import temporary_folder, write_text
+from selfcal_ros.outputs import creating, temporary_folder, write_text
 
 CHUNK_SIZE = 256 * 1024
 UNKNOWN_HASH = "unknown"
@@ -40,7 +40,7 @@ def new_bag(path: str | Path) -> Iterator[Path]:
         If `path` exists, or cannot be created.
     """
     target = Path(path)
-    with _creating(target):
+    with _creating_new(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as unfinished:
             try:
@@ -55,20 +55,14 @@ def new_bag(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _creating(folder: Path) -> Iterator[None]:
+def _creating_new(folder: Path) -> Iterator[None]:
     """Refuse a folder that exists; convert the errors of creating it to an InputError."""
-    try:
+    with creating(folder):
         if folder.exists():
             raise InputError(
                 str(folder), "exists already", "remove it or name another folder"
             )
         yield
-    except OSError as error:
-        raise InputError(
-            str(folder),
-            f"cannot be created ({error.strerror})",
-            "name a writable folder",
-        ) from error
 
 
 def _profiles(metadata: dict[str, str]) -> list[dict]:
@@ -257,7 +251,7 @@ class BagWriter(Closing):
     def __post_init__(self) -> None:
         """Create the folder and start the file."""
         self.path = Path(self.path)
-        with _creating(self.path):
+        with _creating_new(self.path):
             self.path.mkdir(parents=True)
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])

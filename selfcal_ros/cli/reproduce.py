@@ -15,7 +15,7 @@ from selfcal_ros.applications.papers.ibaraki import (
 from selfcal_ros.applications.papers.qiao import SIZES, qiao_text, reproduce_qiao
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.outputs import write_text
+from selfcal_ros.outputs import creating, write_text
 from selfcal_ros.parallel import Progress, check_workers
 from selfcal_ros.reporting.figures.drawing import Drawing
 
@@ -61,7 +61,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--seed", f"{args.seed} is negative", "give 0 or more")
     folder = Path(args.out) if args.out else None
     if folder is not None:
-        _make(folder)
+        with creating(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     workers = check_workers(
         1 if args.workers is None and args.draws < MANY else args.workers
     )
@@ -81,17 +82,6 @@ def run(args: argparse.Namespace) -> int:
             save_picture(drawing, path)
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return int(ExitCode.DONE)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            str(folder),
-            f"cannot be created ({error.strerror})",
-            "name a writable folder",
-        ) from error
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:

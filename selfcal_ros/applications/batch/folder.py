@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from selfcal_ros import __version__, portable
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_json
-from selfcal_ros.outputs import sweep
+from selfcal_ros.outputs import creating, sweep
 from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 
 STORAGE = ".mcap"
@@ -177,16 +177,10 @@ def opened(folder: Path) -> Iterator[None]:
     InputError
         If it cannot be created, or another batch is using it.
     """
-    try:
+    with creating(folder):
         for part in (folder / RECORDS, folder / RESULTS):
             part.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("w")
-    except OSError as error:
-        raise InputError(
-            str(folder),
-            f"cannot be created ({error.strerror})",
-            "name a writable folder",
-        ) from error
     with lock:
         try:
             portable.lock(lock.fileno())
