@@ -17,7 +17,6 @@ from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.outputs import creating, write_text
 from selfcal_ros.parallel import Progress, check_workers
-from selfcal_ros.reporting.figures.drawing import Drawing
 
 MANY = 1000
 """Number of draws from which several processes are faster."""
@@ -89,9 +88,6 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
         args.draws, args.seed, workers=workers, progress=progress
     )
 
-    def figures() -> list[Drawing]:
-        return hu_figures(reproduction)
-
     tables = [
         {
             "name": run.published.name,
@@ -107,7 +103,7 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     ]
     return (
         hu_text(reproduction),
-        figures,
+        lambda: hu_figures(reproduction),
         {
             "noise_free_um": reproduction.noise_free_um,
             "noise_free_deg": reproduction.noise_free_deg,
@@ -121,9 +117,6 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
         args.draws, args.seed, workers=workers, progress=progress
     )
 
-    def figures() -> list[Drawing]:
-        return qiao_figures(reproduction)
-
     programs = [
         {
             "views": program.views,
@@ -134,7 +127,7 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
     ]
     return (
         qiao_text(reproduction),
-        figures,
+        lambda: qiao_figures(reproduction),
         {
             "sizes": SIZES,
             "ranks": reproduction.ranks.tolist(),
@@ -150,12 +143,9 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
 def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     reproduction = reproduce_ibaraki(args.draws, args.seed, progress=progress)
 
-    def figures() -> list[Drawing]:
-        return []
-
     return (
         ibaraki_text(reproduction),
-        figures,
+        list,
         {
             "table_1_mm": {
                 case: values.tolist()

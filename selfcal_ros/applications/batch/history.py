@@ -15,8 +15,8 @@ from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.files import read_text
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
 from selfcal_ros.results import read_result
+from selfcal_ros.units import S_PER_DAY
 
-S_PER_DAY = 86400.0
 COVERAGE = 2.0
 """Coverage factor of U and of the drift that could have been missed."""
 

@@ -13,8 +13,8 @@ import numpy as np
 from selfcal_ros.applications.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.applications.batch.folder import PER, SCHEMA, Record
 from selfcal_ros.reporting.summary.numbers import counted, p_text
+from selfcal_ros.units import S_PER_DAY
 
-S_PER_DAY = 86400.0
 BASE = (
     "bag",
     "first_exposure",
