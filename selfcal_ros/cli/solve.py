@@ -2,7 +2,8 @@
 """``selfcal solve``: a bag in, the calibrated error map out, without middleware."""
 
 import argparse
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -245,7 +246,11 @@ def run(args: argparse.Namespace) -> int:
             "Hu's law needs every reading and cannot hold any out",
             "solve with --method joint",
         )
-    session = _collected(args, collector)
+    session = collected(args, collector)
+    if not session.findings:
+        used = sum(view.used for view in session.measurements.views)
+        for line in rejections(session.measurements.all_rejected(), used):
+            warn(args, f"{args.bag}: {line}")
     measurements = _with_map(args, session.measurements)
     options = solver_options(
         solver, measurements, plate_from=getattr(args, "plate_from", "")
@@ -258,8 +263,8 @@ def run(args: argparse.Namespace) -> int:
             "omit it",
         )
     try:
-        with busy("solving"):
-            result = _calibrated(args, measurements, options, method=solver.method)
+        with busy("solving"), named_bag(args.bag):
+            result = calibrate_by(solver.method, measurements, options)
     except NotIdentifiableError as refused:
         error = with_advice(refused)
         if error.observability is not None:
@@ -282,8 +287,8 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(result)
 
 
-def _collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSession:
-    """Return the readings of the bag; what was rejected or lost is told."""
+def collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSession:
+    """Return the readings of the bag; what was found or lost in it is told."""
     with progress_bar("reading") as bar:
         session = collect_bag(
             args.bag,
@@ -291,15 +296,19 @@ def _collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSess
             namespace=args.namespace,
             progress=lambda count: bar(count, None),
         )
-    warnings = [*session.findings, *session.lost]
-    if not session.findings:
-        measurements = session.measurements
-        used = sum(view.used for view in measurements.views)
-        warnings += rejections(measurements.all_rejected(), used)
     # a clock step is a finding, and noted in the result
-    for line in dict.fromkeys(warnings):
+    for line in dict.fromkeys([*session.findings, *session.lost]):
         warn(args, f"{args.bag}: {line}")
     return session
+
+
+@contextlib.contextmanager
+def named_bag(bag: str) -> Iterator[None]:
+    """Name the bag in errors of its offsets or its plate."""
+    try:
+        yield
+    except (WiringError, PlacingError) as error:
+        raise InputError(f"{bag}: {error.where}", error.what, error.remedy) from error
 
 
 def _require_other_recording(
@@ -336,22 +345,6 @@ def _with_map(args: argparse.Namespace, measurements: Measurements) -> Measureme
     return replace(
         measurements, artifact=with_nodes(measurements.artifact, args.map, "--map")
     )
-
-
-def _calibrated(
-    args: argparse.Namespace,
-    measurements: Measurements,
-    options: Options,
-    *,
-    method: str,
-) -> CalibrationResult:
-    """Return the result without sentences; errors of offsets or plate name the bag."""
-    try:
-        return calibrate_by(method, measurements, options)
-    except (WiringError, PlacingError) as error:
-        raise InputError(
-            f"{args.bag}: {error.where}", error.what, error.remedy
-        ) from error
 
 
 def _described(

@@ -3,18 +3,15 @@
 
 import argparse
 
-from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.bagio.offline import bag_input
 from selfcal_ros.cli import solve
-from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified, warn
+from selfcal_ros.cli.terminal import busy, say, say_unless_qualified
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
-from selfcal_ros.estimation.checks.placing import PlacingError
-from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.comparison.verification import (
     is_believed,
     require_correctable,
 )
-from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.words.findings import worded
@@ -24,7 +21,6 @@ from selfcal_ros.reporting.words.verification import (
 )
 from selfcal_ros.results import read_result
 from selfcal_ros.settings.estimator import solver_options
-from selfcal_ros.settings.nodes import SolverSettings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -92,15 +88,7 @@ def run(args: argparse.Namespace) -> int:
 def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:
     """Return the map of the stage in the bag, on its own or from the plate of the map before."""
     collector, solver = solve.parameters(args)
-    with progress_bar("reading") as bar:
-        measurements, _, lost, findings = collect_bag(
-            args.bag,
-            collector,
-            namespace=args.namespace,
-            progress=lambda count: bar(count, None),
-        )
-    for line in dict.fromkeys([*findings, *lost]):
-        warn(args, f"{args.bag}: {line}")
+    session = solve.collected(args, collector)
     source = bag_input(args.bag)
     if before.input.get("sha256") == source["sha256"]:
         raise InputError(
@@ -108,18 +96,7 @@ def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationRe
             f"the recording that {args.map} was computed from, without the correction",
             "measure again with the correction on",
         )
-    with busy("solving"):
-        return worded(with_input(_solved(args, measurements, solver), source, lost))
-
-
-def _solved(
-    args: argparse.Namespace, measurements: Measurements, solver: SolverSettings
-) -> CalibrationResult:
-    """Return the map with the correction on."""
-    options = solver_options(solver, measurements, plate_from=args.map)
-    try:
-        return calibrate_corrected(measurements, options)
-    except (WiringError, PlacingError) as error:
-        raise InputError(
-            f"{args.bag}: {error.where}", error.what, error.remedy
-        ) from error
+    with busy("solving"), solve.named_bag(args.bag):
+        options = solver_options(solver, session.measurements, plate_from=args.map)
+        result = calibrate_corrected(session.measurements, options)
+    return worded(with_input(result, source, session.lost))
