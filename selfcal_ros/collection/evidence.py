@@ -286,12 +286,12 @@ class DetectionsSeen:
             good = (
                 (table["kind"] == Kind.GRID) & table["has_id"] & (np.abs(where) < FAR_M)
             )
-            good &= np.hypot(table["ox"], table["oy"]) < FAR_M
+            good &= np.hypot(table["offset_x"], table["offset_y"]) < FAR_M
             good &= self.artifact.has(table["m"], table["n"])
             if not (good.any() and readings.view.grid):
                 continue
             x, y = self.artifact.places(table["m"][good], table["n"][good])
-            offset = np.stack([table["ox"][good], table["oy"][good]])
+            offset = np.stack([table["offset_x"][good], table["offset_y"][good]])
             cells = places_of_cells(readings.view, offset)
             named_marks[index] = NamedMarks(
                 view=readings.view.name,

@@ -41,22 +41,21 @@ MAX_TEXT = 8192
 """Largest length of the texts that name a plan and a run: nodes keep them."""
 MAX_EXPOSURES = 5_000_000
 """Largest number of exposures of a view in the simulated cell: 240 MB."""
-DETECTION = np.dtype(
-    [
-        ("stamp", "i8"),
-        ("kind", "u1"),
-        ("has_id", "?"),
-        ("m", "i8"),
-        ("n", "i8"),
-        ("k", "i8"),
-        ("ox", "f8"),
-        ("oy", "f8"),
-        ("ot", "f8"),
-        ("sigma", "f8"),
-        ("score", "f8"),
-    ]
-)
-"""Many detections as a table: fields as in `Detection`, offsets as ox, oy, ot."""
+DETECTED = {
+    "kind": "u1",
+    "has_id": "?",
+    "m": "i8",
+    "n": "i8",
+    "k": "i8",
+    "offset_x": "f8",
+    "offset_y": "f8",
+    "offset_theta": "f8",
+    "sigma": "f8",
+    "score": "f8",
+}
+"""Fields of selfcal_msgs/MarkDetection below its header -> numpy type."""
+DETECTION = np.dtype([("stamp", "i8"), *DETECTED.items()])
+"""Many detections as a table: fields as in `Detection`."""
 
 
 class Kind(IntEnum):

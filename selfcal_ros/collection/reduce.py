@@ -72,7 +72,11 @@ def canonical(detections: np.ndarray) -> np.ndarray:
     """
     d = detections.copy()
     grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
-    for field, has_field in (("ox", grid), ("oy", grid), ("ot", angular)):
+    for field, has_field in (
+        ("offset_x", grid),
+        ("offset_y", grid),
+        ("offset_theta", angular),
+    ):
         d[field] = np.where(has_field, d[field] + 0.0, 0.0)
     for field, has_field in (("m", grid), ("n", grid), ("k", angular)):
         d[field] *= has_field & d["has_id"]
@@ -104,11 +108,13 @@ def clean(
     rejected[Reason.UNKNOWN_KIND] = int((~known_kind).sum())
     d = _where(known_kind, detections)
     finite = d["sigma"] >= 0
-    for field in ("ox", "oy", "ot", "sigma", "score"):
+    for field in ("offset_x", "offset_y", "offset_theta", "sigma", "score"):
         finite &= np.isfinite(d[field])
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
     d = _where(finite, d)
-    far = (np.abs(d["ox"]) > LARGEST_OFFSET) | (np.abs(d["oy"]) > LARGEST_OFFSET)
+    far = (np.abs(d["offset_x"]) > LARGEST_OFFSET) | (
+        np.abs(d["offset_y"]) > LARGEST_OFFSET
+    )
     rejected[Reason.TOO_FAR] = int(far.sum())
     d = _where(~far, d)
     unique = _canonical(d)
@@ -321,7 +327,7 @@ def _identified(
     assignment, number = _identified_at(artifact, view, d, position, rules)
     if view.image is None or not np.isin(assignment.reasons, DISPLACED).any():
         return assignment, number
-    offset = np.stack([d["ox"], d["oy"]])
+    offset = np.stack([d["offset_x"], d["offset_y"]])
     named = d["has_id"] & (assignment.reasons != Reason.UNKNOWN_MARK)
     marks = artifact.places(d["m"][named], d["n"][named])
     away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
@@ -397,7 +403,7 @@ def _identified_at(
     of_cell: bool = False,
 ) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
-    offset = np.stack([d["ox"], d["oy"]])
+    offset = np.stack([d["offset_x"], d["offset_y"]])
     number = stops.numbers_of(view, stops.cells_of(view, offset, shift))
     cell_places_m = stops.places_of_cells(view, offset, shift)
     away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m + (
@@ -432,7 +438,10 @@ def _beside_a_nearer(d: np.ndarray, assignment: identify.MarkAssignment) -> np.n
     accepted = np.flatnonzero(assignment.reasons == None)  # noqa: E711
     if (np.diff(d["stamp"][accepted]) > 0).all():
         return accepted[:0]
-    away = assignment.deviation[:, accepted] - np.stack([d["ox"], d["oy"]])[:, accepted]
+    away = (
+        assignment.deviation[:, accepted]
+        - np.stack([d["offset_x"], d["offset_y"]])[:, accepted]
+    )
     order = accepted[np.lexsort((np.hypot(*away), d["stamp"][accepted]))]
     _, first, exposure = np.unique(
         d["stamp"][order], return_index=True, return_inverse=True
@@ -452,7 +461,9 @@ def _reduce_grid(
     """Return the grid readings of a view, or of a sub-view: offsets from the place of its cell."""
     d = marks.detections
     key = artifact.flat(*marks.index)
-    offset = np.stack([d["ox"] - view.cell_m.real, d["oy"] - view.cell_m.imag])
+    offset = np.stack(
+        [d["offset_x"] - view.cell_m.real, d["offset_y"] - view.cell_m.imag]
+    )
     means = reduce_repeats(
         key,
         marks.deviation,
@@ -510,12 +521,12 @@ def _reduce_angular(
     stage = exposures.at(d["stamp"])
     why = _reasons((stage.theta,), (stage.x, stage.y))
     # an offset beyond half a turn is invalid, though it may wrap to a small one
-    why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
+    why[(why == None) & (np.abs(d["offset_theta"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
     assignment = identify.identify_angular(
         artifact,
         view,
-        _reading(rules.sense, theta, d["ot"]),
+        _reading(rules.sense, theta, d["offset_theta"]),
         ids=d["k"],
         has_id=d["has_id"],
         rules=rules.identity,
@@ -539,8 +550,8 @@ def _reduce_angular(
     )
     _count(rejected, Reason.OUTLIER, means.outlier)
     # of the axis relative to the line, without full turns
-    place = identify.wrap(v - d["ot"])
-    motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
+    place = identify.wrap(v - d["offset_theta"])
+    motion = repeat_motion(k, place[None], d["offset_theta"][None], means.outlier)
     about = place[~means.outlier].mean() if len(means.key) else 0.0
     return {
         "k": means.key.astype(np.int64),

@@ -59,7 +59,7 @@ def detections(
     marks = np.array([np.rint(site(int(t // period_s)) / PITCH_M) for t in since_s])
     table["m"], table["n"] = marks.astype(int).reshape(-1, 2).T
     table["kind"], table["has_id"], table["score"] = Kind.GRID, True, 0.9
-    table["ox"], table["oy"] = rng.normal(0, 2e-8, (2, len(table)))
+    table["offset_x"], table["offset_y"] = rng.normal(0, 2e-8, (2, len(table)))
     return table
 
 

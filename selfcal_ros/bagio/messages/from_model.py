@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.expected import Missing, ViewProgress
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import DETECTED, Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import (
@@ -78,21 +78,9 @@ def image(values: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Fi
 
 def detection(d: Detection, frame_id: str) -> Fields:
     """Return the fields of a selfcal_msgs/MarkDetection."""
-    names = (
-        "kind",
-        "has_id",
-        "m",
-        "n",
-        "k",
-        "offset_x",
-        "offset_y",
-        "offset_theta",
-        "sigma",
-        "score",
-    )
     return {
         "header": header(d.stamp_ns, frame_id),
-        **{name: getattr(d, name) for name in names},
+        **{name: getattr(d, name) for name in DETECTED},
     }
 
 

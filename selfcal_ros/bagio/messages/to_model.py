@@ -16,6 +16,7 @@ import numpy as np
 
 from selfcal_ros.bagio.messages import cdr
 from selfcal_ros.collection.inputs import (
+    DETECTED,
     DETECTION,
     Command,
     Detection,
@@ -55,7 +56,6 @@ JOINT_STATE = (
 """Fields of sensor_msgs/msg/JointState."""
 STAMP_END = 12
 """Bytes of the encapsulation, and of the stamp after it."""
-_OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
 
 
 def stamp_ns(message: Any) -> int:
@@ -621,9 +621,6 @@ def detection_table(group: cdr.Columns) -> np.ndarray:
     """Return messages of selfcal_msgs/MarkDetection as a table of `collection.inputs.DETECTION`."""
     table = np.empty(len(group), dtype=DETECTION)
     table["stamp"] = stamps_ns(group)
-    table["has_id"] = group["has_id"] != 0
-    for name in ("kind", "m", "n", "k", "sigma", "score"):
+    for name in DETECTED:
         table[name] = group[name]
-    for name, field in _OFFSETS.items():
-        table[name] = group[field]
     return table
