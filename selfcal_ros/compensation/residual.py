@@ -142,6 +142,24 @@ def reached(
     return stage.correct(*frame.from_machine(px, py))
 
 
+def plane_of(error_map: ErrorMap) -> ErrorMap:
+    """Return the map of x and y alone, without angles."""
+    return replace(
+        error_map,
+        artifact=replace(error_map.artifact, angular_count=0, harmonics=0),
+        g_theta=np.zeros(0),
+        u_g_theta=np.zeros(0),
+    )
+
+
+def added_m(
+    correct: Correction, frame: MachineFrame, px: np.ndarray, py: np.ndarray
+) -> np.ndarray:
+    """Return what a table adds at positions of the controller, stage axes, (2, ...), m."""
+    cx, cy = correct(px, py)
+    return np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
+
+
 def plane_residuals(
     error_map: ErrorMap,
     frame: MachineFrame,
@@ -155,12 +173,7 @@ def plane_residuals(
     the error of the controller's interpolation.
     """
     plate, valid = error_map.artifact, error_map.valid
-    plane = replace(
-        error_map,
-        artifact=replace(plate, angular_count=0, harmonics=0),
-        g_theta=np.zeros(0),
-        u_g_theta=np.zeros(0),
-    )
+    plane = plane_of(error_map)
     places = [
         ("sites", np.stack([plate.x_m[valid], plate.y_m[valid]]), Compensator(plane))
     ]
@@ -206,8 +219,7 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
     """
     plate = error_map.artifact
     px, py = frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy)
-    cx, cy = active(px, py)
-    added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
+    added = added_m(active, frame, px, py)
     map_error = np.stack([error_map.gx, error_map.gy])
     limit_m = plate.grid_pitch_m / 4
     step_m = _steepest(added)

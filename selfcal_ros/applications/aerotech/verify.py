@@ -27,7 +27,9 @@ from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import (
     Correction,
     Residual,
+    added_m,
     combined,
+    plane_of,
     plane_residuals,
     residual_of,
 )
@@ -217,12 +219,7 @@ def _at_entries(
     """
     filled_map, _ = fill_unknown(error_map)
     plate = filled_map.artifact
-    plane = replace(
-        filled_map,
-        artifact=replace(plate, angular_count=0, harmonics=0),
-        g_theta=np.zeros(0),
-        u_g_theta=np.zeros(0),
-    )
+    plane = plane_of(filled_map)
     nodes = plate.x_m[:, 0], plate.y_m[0]
     places = [np.stack([plate.x_m.ravel(), plate.y_m.ravel()])]
     for table in tables:
@@ -245,9 +242,8 @@ def _at_entries(
     position = position[:, np.append(np.full(sites, True), between)]
     if not between.any():
         return None
-    px, py = frame.to_machine(*position)
-    cx, cy = plane_correction(evaluator, frame)(px, py)
-    added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
+    correct = plane_correction(evaluator, frame)
+    added = added_m(correct, frame, *frame.to_machine(*position))
     error = np.stack(Compensator(plane).error(*position))
     doubt = np.abs(
         np.stack(Compensator(plane, method="bicubic").error(*position)) - error
