@@ -93,13 +93,18 @@ def _corners(artifact: Artifact) -> np.ndarray:
     )
 
 
+def _field(frame: Frame, half_mm: Sequence[float], fill: str) -> None:
+    """Fill the field, which reaches to `half_mm` on both sides of its centre."""
+    left, bottom = frame.at(-half_mm[0], -half_mm[1])
+    right, top = frame.at(half_mm[0], half_mm[1])
+    frame.drawing.box(left, top, right - left, bottom - top, fill=fill)
+
+
 def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     drawing, pitch = frame.drawing, artifact.grid_pitch_m
     half = np.array(artifact.reach)[:, None]
     field = [(reach + 0.3 * pitch) * MM_PER_M for reach in artifact.field_half_m]
-    low = frame.at(-field[0], -field[1])
-    high = frame.at(*field)
-    drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
+    _field(frame, field, "e2")
     drawing.line(
         _at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6
     )
@@ -220,9 +225,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     }
     drawing = parts.titled("rejected", "Positions of rejected grid readings")
     for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
-        low = frame.at(-field[0], -field[1])
-        high = frame.at(*field)
-        drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
+        _field(frame, field, "card")
         for reason, colour in colours.items():
             at = [
                 (x, y) for view, why, x, y in places if (view, why) == (title, reason)
