@@ -125,25 +125,15 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
             vertices.append(line[0])
             codes.append(Outline.CLOSEPOLY)
     dash = (0, tuple(length * points for length in item.dash)) if item.dash else "solid"
-    fill = to_rgba(_light(item.fill), item.opacity)
-    stroke = to_rgba(_light(item.stroke))
     axes.add_artist(
         PathPatch(
-            Outline(vertices, codes),
-            facecolor=fill,
-            edgecolor=stroke,
-            linewidth=item.width * points if item.stroke else 0,
-            linestyle=dash,
-            zorder=order,
-            clip_on=False,
+            Outline(vertices, codes), linestyle=dash, **_style(item, points, order)
         )
     )
 
 
 def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
     wide, high = zip(*item.radii, strict=True)
-    fill = to_rgba(_light(item.fill), item.opacity)
-    stroke = to_rgba(_light(item.stroke))
     axes.add_collection(
         EllipseCollection(
             [2 * r for r in wide],
@@ -152,14 +142,21 @@ def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
             units="xy",
             offsets=item.centres,
             offset_transform=axes.transData,
-            facecolor=fill,
-            edgecolor=stroke,
-            linewidth=item.width * points if item.stroke else 0,
-            zorder=order,
-            clip_on=False,
+            **_style(item, points, order),
         ),
         autolim=False,
     )
+
+
+def _style(item: Path | Discs, points: float, order: int) -> dict[str, Any]:
+    """Return the keywords of matplotlib for the fill and the outline of an item."""
+    return {
+        "facecolor": to_rgba(_light(item.fill), item.opacity),
+        "edgecolor": to_rgba(_light(item.stroke)),
+        "linewidth": item.width * points if item.stroke else 0,
+        "zorder": order,
+        "clip_on": False,
+    }
 
 
 def _label(item: Label, axes: Axes, points: float, order: int) -> None:
