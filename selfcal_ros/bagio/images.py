@@ -16,11 +16,16 @@ from mcap.records import Channel, Message, Schema
 
 from selfcal_ros.bagio.mcap_stream import streams
 from selfcal_ros.bagio.messages import from_model
-from selfcal_ros.bagio.messages.to_model import EncoderBlock
 from selfcal_ros.bagio.reader import CLOCK_LIMIT_S, BagReader, overlap
 from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import (
+    Command,
+    Detection,
+    EncoderBlock,
+    EncoderSample,
+    Phase,
+)
 from selfcal_ros.errors import InputError, NoDataError, known_are
 from selfcal_ros.files import csv_rows, read_bytes, read_text
 from selfcal_ros.model.view import Plan

@@ -14,12 +14,11 @@ import numpy as np
 
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.messages import to_model
-from selfcal_ros.bagio.messages.to_model import EncoderBlock
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock_steps import step_lines
 from selfcal_ros.collection.collector import Collector, keep_freed_memory
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import Reason
+from selfcal_ros.collection.inputs import EncoderBlock, Reason
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file, read_json
 from selfcal_ros.model.readings import Measurements

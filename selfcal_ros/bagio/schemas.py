@@ -34,6 +34,7 @@ from selfcal_ros.bagio.messages.cdr import (
     Payloads,
     layout_of,
 )
+from selfcal_ros.collection.inputs import EncoderBlock
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.topics import (
     DETECTION_TOPIC,
@@ -287,7 +288,7 @@ def _free_of_bounds(kind: Any) -> Any:
     return node, inner
 
 
-Input = to_model.EncoderBlock | np.ndarray | object
+Input = EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
 BLOCKS: dict[str, Callable[[Columns], Input]] = {
     ENCODER_TOPIC: to_model.encoder_block,
@@ -449,7 +450,7 @@ def _block(role: str, message: Any) -> Input:
         velocities = (
             np.array([sample.velocities], dtype=float) if sample.velocities else None
         )
-        return to_model.EncoderBlock(
+        return EncoderBlock(
             np.array([sample.stamp_ns]),
             sample.names,
             np.array([sample.positions], dtype=float),

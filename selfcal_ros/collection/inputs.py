@@ -84,6 +84,32 @@ class EncoderSample:
     velocities: tuple[float, ...] = ()
 
 
+@dataclass(frozen=True)
+class EncoderBlock:
+    """Encoder samples of the same joints.
+
+    Attributes
+    ----------
+    stamps_ns : int64 array (n,)
+        Stamps of the headers.
+    names : tuple of str
+        Joints, as named in the messages.
+    positions : float array (n, j)
+        Indicated positions, m or rad; j differs from the number of names in malformed messages.
+    velocities : float array (n, i) or None
+        m/s or rad/s; None if not in the messages.
+    """
+
+    stamps_ns: np.ndarray
+    names: tuple[str, ...]
+    positions: np.ndarray
+    velocities: np.ndarray | None
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.stamps_ns)
+
+
 @dataclass(frozen=True, slots=True)
 class Detection:
     """One detected mark; fields as in selfcal_msgs/MarkDetection (m, rad, stage axes)."""

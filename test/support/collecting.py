@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.messages.to_model import EncoderBlock
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import (
     DETECTION,
     Command,
     Detection,
+    EncoderBlock,
     EncoderSample,
     Kind,
 )

@@ -7,7 +7,6 @@ Messages of rclpy and of rosbags have the same fields.
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from struct import Struct
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from selfcal_ros.collection.inputs import (
     DETECTION,
     Command,
     Detection,
+    EncoderBlock,
     EncoderSample,
     Phase,
 )
@@ -469,32 +469,6 @@ def _refuse_not_finite(
             "the error of no site or of no line is known",
             "measure, or correct the publisher",
         )
-
-
-@dataclass(frozen=True)
-class EncoderBlock:
-    """Encoder samples of the same joints.
-
-    Attributes
-    ----------
-    stamps_ns : int64 array (n,)
-        Stamps of the headers.
-    names : tuple of str
-        Joints, as named in the messages.
-    positions : float array (n, j)
-        Indicated positions, m or rad; j differs from the number of names in malformed messages.
-    velocities : float array (n, i) or None
-        m/s or rad/s; None if not in the messages.
-    """
-
-    stamps_ns: np.ndarray
-    names: tuple[str, ...]
-    positions: np.ndarray
-    velocities: np.ndarray | None
-
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return len(self.stamps_ns)
 
 
 class PositionEditor:

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.messages import from_model, to_model
-from selfcal_ros.bagio.messages.to_model import EncoderBlock
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
 from selfcal_ros.collection.clock_steps import ClockStep, future_lines, step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import Command, Phase, Reason, advice
+from selfcal_ros.collection.inputs import Command, EncoderBlock, Phase, Reason, advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import (
     Measurements,
