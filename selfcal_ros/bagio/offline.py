@@ -18,7 +18,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock_steps import step_lines
 from selfcal_ros.collection.collector import Collector, keep_freed_memory
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import EncoderBlock, Reason
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file, read_json
 from selfcal_ros.model.readings import Measurements
@@ -252,13 +252,8 @@ def block_handlers(
             collector.refuse("command", Reason.COMMAND_BAD)
             complaints.append(f"a view command was not used: {error}")
 
-    def take_encoder(block: EncoderBlock) -> None:
-        collector.add_encoder_block(
-            block.stamps_ns, block.names, block.positions, block.velocities
-        )
-
     return {
-        ENCODER_TOPIC: take_encoder,
+        ENCODER_TOPIC: collector.add_encoder_block,
         DETECTION_TOPIC: collector.add_detection_block,
         COMMAND_TOPIC: take_command,
     }

@@ -446,16 +446,7 @@ class Waiting:
 def _block(role: str, message: Any) -> Input:
     """Return a single decoded message as a block of one; a command unchanged."""
     if role == ENCODER_TOPIC:
-        sample = to_model.encoder_sample(message)
-        velocities = (
-            np.array([sample.velocities], dtype=float) if sample.velocities else None
-        )
-        return EncoderBlock(
-            np.array([sample.stamp_ns]),
-            sample.names,
-            np.array([sample.positions], dtype=float),
-            velocities,
-        )
+        return EncoderBlock.of([to_model.encoder_sample(message)])
     if role == DETECTION_TOPIC:
         return to_model.detection(message).as_table()
     return message

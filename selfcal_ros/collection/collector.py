@@ -6,7 +6,7 @@ The result is a function of the set of messages alone, so that live nodes, a rep
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -107,36 +107,13 @@ class Collector:
 
     def add_encoder(self, sample: inputs.EncoderSample) -> None:
         """Take one encoder message; an unusable one is counted under its reason."""
-        self.add_encoder_block(
-            np.array([sample.stamp_ns]),
-            sample.names,
-            np.array([sample.positions], dtype=float),
-            np.array([sample.velocities], dtype=float),
-        )
+        self.add_encoder_block(inputs.EncoderBlock.of([sample]))
 
-    def add_encoder_block(
-        self,
-        stamps_ns: np.ndarray,
-        names: Sequence[str],
-        positions: np.ndarray,
-        velocities: np.ndarray | None = None,
-    ) -> None:
-        """Take encoder messages of the same joints; unusable ones are counted under their reason.
-
-        Parameters
-        ----------
-        stamps_ns : int64 array (n,)
-            Stamps.
-        names : sequence of str
-            Joints, as named in the messages.
-        positions : float array (n, j)
-            Indicated positions, m or rad.
-        velocities : float array (n, i), optional
-            m/s or rad/s; None or without columns if unknown.
-        """
-        count = len(stamps_ns)
+    def add_encoder_block(self, block: inputs.EncoderBlock) -> None:
+        """Take encoder messages; unusable ones are counted under their reason."""
+        count = len(block)
+        names, positions, speeds = block.names, block.positions, block.velocities
         self.received["encoder"] += count
-        speeds = None if velocities is None or not velocities.shape[1] else velocities
         if positions.shape[1] != len(names) or (
             speeds is not None and speeds.shape[1] != len(names)
         ):
@@ -152,7 +129,7 @@ class Collector:
             good = np.isfinite(positions[:, column])
             finite &= good
             joint.store.add_block(
-                stamps_ns[good],
+                block.stamps_ns[good],
                 positions[good, column],
                 None if speeds is None else speeds[good, column],
             )

@@ -6,7 +6,7 @@ nanoseconds.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from enum import IntEnum, StrEnum
 
@@ -104,6 +104,17 @@ class EncoderBlock:
     names: tuple[str, ...]
     positions: np.ndarray
     velocities: np.ndarray | None
+
+    @classmethod
+    def of(cls, samples: Sequence[EncoderSample]) -> "EncoderBlock":
+        """Return samples of the same joints as a block."""
+        velocities = [sample.velocities for sample in samples]
+        return cls(
+            np.array([sample.stamp_ns for sample in samples]),
+            samples[0].names,
+            np.array([sample.positions for sample in samples], dtype=float),
+            np.array(velocities, dtype=float) if velocities[0] else None,
+        )
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.inputs import DETECTION, Command, Kind, Phase
+from selfcal_ros.collection.inputs import DETECTION, Command, EncoderBlock, Kind, Phase
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.model.view import View
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> dict[str, float]:
             )
             where = positions(since, args.period, rng)
             stamps = START_NS + np.rint(since * S).astype(np.int64)
-            collector.add_encoder_block(stamps, JOINTS, where)
+            collector.add_encoder_block(EncoderBlock(stamps, JOINTS, where, None))
         exposed = np.arange(second, second + 1, args.period) + 0.35 * args.period
         collector.add_detection_block(detections(exposed, args.period, rng))
         busy += time.process_time() - begun

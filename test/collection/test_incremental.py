@@ -13,7 +13,13 @@ from selfcal_ros.collection import view_readings
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.exposures import Exposures, Tracks
-from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import (
+    DETECTION,
+    Command,
+    Detection,
+    EncoderBlock,
+    EncoderSample,
+)
 from selfcal_ros.collection.marks import identify, repeats
 from selfcal_ros.collection.samples import Limits
 from selfcal_ros.errors import NoDataError
@@ -165,15 +171,7 @@ def blocks(events, size):
 
 def feed_block(collector, kind, names, group):
     if kind == "encoder":
-        speeds = (
-            np.array([e.velocities for e in group]) if group[0].velocities else None
-        )
-        collector.add_encoder_block(
-            np.array([e.stamp_ns for e in group]),
-            names,
-            np.array([e.positions for e in group]),
-            speeds,
-        )
+        collector.add_encoder_block(EncoderBlock.of(group))
     elif kind == "detection":
         rows = [
             (
@@ -235,12 +233,8 @@ def test_blocks_give_what_single_messages_give(size, speeds):
 def test_blocks_that_cannot_be_used_are_counted(names, positions, velocities, reasons):
     collector = fresh()
     positions = np.array(positions)
-    collector.add_encoder_block(
-        np.arange(3),
-        names,
-        positions,
-        None if velocities is None else np.array(velocities),
-    )
+    speeds = None if velocities is None else np.array(velocities)
+    collector.add_encoder_block(EncoderBlock(np.arange(3), names, positions, speeds))
     assert collector.unusable == reasons
     assert collector.received == {"encoder": 3, "detection": 0, "command": 0}
     finite = (

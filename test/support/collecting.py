@@ -100,7 +100,7 @@ def scene(
 def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
     """Return a collector that has taken all events in their order, alike ones in blocks."""
     collector = Collector(CollectorSettings.checked(parameters, "test"))
-    for (kind, *joints), alike in groupby(events, _alike):
+    for (kind, *_), alike in groupby(events, _alike):
         if kind is Command:
             for command in alike:
                 collector.add_command(command)
@@ -109,13 +109,7 @@ def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
                 np.array([*map(astuple, alike)], dtype=DETECTION)
             )
         else:
-            samples = [*alike]
-            collector.add_encoder_block(
-                np.array([s.stamp_ns for s in samples]),
-                joints[0],
-                np.array([s.positions for s in samples], dtype=float),
-                np.array([s.velocities for s in samples], dtype=float),
-            )
+            collector.add_encoder_block(EncoderBlock.of([*alike]))
     return collector
 
 
@@ -146,13 +140,7 @@ def digest(events: Iterable[Event], **parameters: Any) -> str:
 
 def encoder_block(sample: EncoderSample) -> EncoderBlock:
     """Return a block of one sample."""
-    velocities = np.array([sample.velocities]) if sample.velocities else None
-    return EncoderBlock(
-        np.array([sample.stamp_ns]),
-        sample.names,
-        np.array([sample.positions]),
-        velocities,
-    )
+    return EncoderBlock.of([sample])
 
 
 def detection_table(detection: Detection) -> np.ndarray:

@@ -14,7 +14,13 @@ import numpy as np
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.diagnosis import fault_text
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
+from selfcal_ros.collection.inputs import (
+    Command,
+    Detection,
+    EncoderBlock,
+    EncoderSample,
+    Kind,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import wiring_faults
 from selfcal_ros.model.artifact import MAX_GRID_SIZE
@@ -123,7 +129,7 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> Outcome:
     collector = Collector(settings)
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
-    for (names, _, _), alike in groupby(
+    for _, alike in groupby(
         samples,
         key=lambda sample: (
             sample.names,
@@ -131,19 +137,7 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> Outcome:
             len(sample.velocities),
         ),
     ):
-        stamps, positions, velocities = zip(
-            *(
-                (sample.stamp_ns, sample.positions, sample.velocities)
-                for sample in alike
-            ),
-            strict=True,
-        )
-        collector.add_encoder_block(
-            np.array(stamps),
-            names,
-            np.array(positions, dtype=float),
-            np.array(velocities, dtype=float),
-        )
+        collector.add_encoder_block(EncoderBlock.of([*alike]))
     for event in fault.events:
         if isinstance(event, Detection):
             collector.add_detection(event)

@@ -106,9 +106,7 @@ class CollectingSession:
         self._encoder_s = (
             self._ports.now_s() - int(np.atleast_1d(age_ns)[-1]) * S_PER_NS
         )
-        self.collector.add_encoder_block(
-            block.stamps_ns, block.names, block.positions, block.velocities
-        )
+        self.collector.add_encoder_block(block)
         self._encoder_rate.add(block.stamps_ns)
         self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
         self._dirty = True
