@@ -366,7 +366,8 @@ def test_a_series_that_two_views_cannot_contradict_says_so(
 ):
     _, readings = measured(plan(count, harmonics, turns_deg))
     result = calibrate(readings, BARE)
-    assert (HarmonicsUntested() in result.findings) is said
+    assert (HarmonicsUntested() in result.verdict.failed) is said
+    assert (result.verdict.grade is Grade.NOT_QUALIFIED) is said
     text = "whether the harmonics of the angular map suffice for the rotary encoder"
     assert (text in json.dumps(result_to_dict(worded(result)))) is said
 

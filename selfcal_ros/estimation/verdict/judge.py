@@ -149,9 +149,6 @@ def judged(
         enlargements(result, searched.terms, shown_effects),
     )
     untested = solved.model is not None and is_untested(solved.model.problem)
-    lines_untested = solved.model is not None and harmonics_untested(
-        solved.model.problem.system.angular
-    )
     result = replace(
         result,
         verdict=verdict,
@@ -160,7 +157,6 @@ def judged(
             *_visits_findings(checked),
             *views_findings(measurements),
             *[RoughnessUntested()] * untested,
-            *[HarmonicsUntested()] * lines_untested,
             *_without_readings(solved, options),
         ),
         provenance=provenance_of(measurements, options),
@@ -198,6 +194,10 @@ def _failed_tests(
         failed.append(AxesNotMet(size=size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(NotConverged())
+    if solved.model is not None and harmonics_untested(
+        solved.model.problem.system.angular
+    ):
+        failed.append(HarmonicsUntested())
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
     return failed
