@@ -15,6 +15,7 @@ from selfcal_ros.cli.terminal import busy, late_progress, put, say, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import KNOWN
 from selfcal_ros.estimation.observability.plan_check import (
+    PlanCheck,
     Prediction,
     check_plan,
     predict_plan,
@@ -51,6 +52,10 @@ from selfcal_ros.units import MM_PER_M, UM_PER_M
 SHOWN = 8
 """Default number of suggestions."""
 
+HARMONICS_UNTESTED = (
+    "the views of lines do not show whether the harmonics of the angular map suffice, and the "
+    "result will not be qualified: read the lines in a further view at another turn"
+)
 NODES_ONLY = (
     "every reading lies at a node of the map: to test the error between nodes, give the "
     "map its own nodes (map:) and add a view shifted by half a pitch"
@@ -169,10 +174,9 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
                 plan, terms, assumed, alone, declared=[term.name for term in declared]
             )
     observability = worded_observability(observability)
+    checked = replace(checked, observability=observability)
     if args.json:
-        summary = _check_json(
-            plan, (observability, checked.unknown_sites), alone, maps=args.map
-        )
+        summary = _check_json(plan, checked, alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
             summary["predicted"] |= {
@@ -192,7 +196,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
         summary["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
         put(summary | {"terms": plan_terms.terms_json(checks)})
     else:
-        lines = _check_text(plan, (observability, checked.unknown_sites), alone)
+        lines = _check_text(plan, checked, alone)
         if alone is not None and args.sigma is not None:
             lines.append(_in_um("XY    ", alone, plan, assumed))
         if model and joint is not None:
@@ -254,12 +258,12 @@ def _judge(
 
 def _check_json(
     plan: Plan,
-    checked: tuple[Observability, int],
+    checked: PlanCheck,
     predicted: Prediction | None,
     *,
     maps: bool,
 ) -> dict[str, Any]:
-    observability, unknown = checked
+    observability = checked.observability
     out = {
         "plan_id": plan.plan_id,
         "rank": observability.rank,
@@ -269,9 +273,10 @@ def _check_json(
         "modes": [mode.text for mode in observability.modes],
         "advice": [advice.text for advice in observability.advice],
         "predicted": None,
-        "unknown_sites": unknown if observability.identifiable else None,
+        "unknown_sites": checked.unknown_sites if observability.identifiable else None,
         "unchecked_sites": observability.unchecked_sites,
         "unchecked_lines": observability.unchecked_lines,
+        "harmonics_untested": checked.harmonics_untested,
     }
     if predicted is not None:
         out["predicted"] = plain(
@@ -295,10 +300,10 @@ def _check_json(
 
 
 def _check_text(
-    plan: Plan, checked: tuple[Observability, int], predicted: Prediction | None
+    plan: Plan, checked: PlanCheck, predicted: Prediction | None
 ) -> list[str]:
     artifact = plan.artifact
-    observability, unknown = checked
+    observability = checked.observability
     marks = (
         f"{artifact.shape[0]} x {artifact.shape[1]}"
         if artifact.marks is None
@@ -320,7 +325,8 @@ def _check_text(
             *(f"  - {advice.text}" for advice in observability.advice),
         ]
     lines += [
-        _known_text(plan, unknown),
+        _known_text(plan, checked.unknown_sites),
+        *([HARMONICS_UNTESTED] if checked.harmonics_untested else []),
         *_unchecked_text(observability),
         _check_stops_text(plan),
         *([] if artifact.map_grid else [NODES_ONLY]),

@@ -761,3 +761,19 @@ def test_the_predictions_stand_together_below_their_heading(capsys):
         "XY with drift, plate_shape:3e-08:",
         "XY with drift, plate_shape:3e-08:",
     ]
+
+
+def test_a_plan_whose_harmonics_nothing_tests_says_so_before_it_is_measured(
+    tmp_path, capsys
+):
+    text = Path(shipped("rotary")).read_text()
+    fewer = tmp_path / "two_views.yaml"
+    fewer.write_text(
+        text.replace("  - {name: turned_101, rotation_deg: 101, grid: false}\n", "")
+    )
+    said = "do not show whether the harmonics of the angular map suffice"
+    for path, is_said in ((fewer, True), (shipped("rotary"), False)):
+        assert main(["plan", "check", str(path)]) == 0
+        assert (said in capsys.readouterr().out) is is_said
+        main(["plan", "check", str(path), "--json"])
+        assert json.loads(capsys.readouterr().out)["harmonics_untested"] is is_said

@@ -49,6 +49,8 @@ class AngularSystem(PlateEliminated):
     """
 
     coordinates, of_view = 1, 1
+    is_untested = False
+    """A value at each line needs no test of whether it suffices."""
 
     def __init__(
         self, turns: tuple[float, ...], weight: np.ndarray, *, known_plate: bool = False
@@ -204,6 +206,20 @@ class HarmonicSystem(AngularSystem):
     def n_determined(self) -> int:
         """Number of coefficients that the readings determine, however badly; not the constant."""
         return int(self._determined.sum())
+
+    @property
+    def n_left(self) -> int:
+        """Number of readings that plate, rotations and series leave."""
+        of_plate = int(self.mark_read.sum()) + self.n_views - 1
+        return self.n_readings - of_plate - self.n_determined
+
+    @property
+    def is_untested(self) -> bool:  # type: ignore[override]
+        """Whether no residual shows harmonics that the series lacks.
+
+        Lines read in two views leave fewer numbers than it has coefficients: it follows nearly all.
+        """
+        return self.n_left < self.n_determined
 
     @property
     def mean_variance(self) -> float:

@@ -135,10 +135,13 @@ class PlanCheck:
         Rank, deficiency, unseen modes, advice.
     unknown_sites : int
         Sites, or nodes of the map, that remain unknown although the plan identifies the stage.
+    harmonics_untested : bool
+        Whether the views of lines are too few to show harmonics that the angular map lacks.
     """
 
     observability: Observability
     unknown_sites: int = 0
+    harmonics_untested: bool = False
 
 
 @one_thread()
@@ -150,7 +153,11 @@ def check_plan(plan: Plan) -> PlanCheck:
     )
     if not observability.identifiable:
         return PlanCheck(with_unseen_modes(observability, system, plan))
-    return PlanCheck(observability, unknown_sites=int((~system.known_sites).sum()))
+    return PlanCheck(
+        observability,
+        unknown_sites=int((~system.known_sites).sum()),
+        harmonics_untested=system.angular.is_untested,
+    )
 
 
 def with_unseen_modes(

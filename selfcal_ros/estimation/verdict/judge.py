@@ -38,7 +38,6 @@ from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
-from selfcal_ros.estimation.verdict.roughness import harmonics_untested
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
@@ -194,9 +193,7 @@ def _failed_tests(
         failed.append(AxesNotMet(size=size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(NotConverged())
-    if solved.model is not None and harmonics_untested(
-        solved.model.problem.system.angular
-    ):
+    if solved.model is not None and solved.model.problem.system.angular.is_untested:
         failed.append(HarmonicsUntested())
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)

@@ -216,7 +216,7 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
     finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
     fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
     n_further = fine.n_determined - coarse.n_determined
-    dof = _left_by(fine)
+    dof = fine.n_left
     if n_further < 1 or dof < 1:
         return None
     (squares_coarse, coarse_map), (squares_fine, fine_map) = (
@@ -231,20 +231,6 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
         n_further,
         (coarse.harmonics,),
     )
-
-
-def harmonics_untested(lines: AngularSystem) -> bool:
-    """Return whether no residual shows harmonics that a Fourier series lacks.
-
-    Lines read in two views leave fewer numbers than it has coefficients: it follows nearly all.
-    """
-    return isinstance(lines, HarmonicSystem) and _left_by(lines) < lines.n_determined
-
-
-def _left_by(lines: HarmonicSystem) -> int:
-    """Return the number of readings that plate, rotations and series leave."""
-    of_plate = int(lines.mark_read.sum()) + lines.n_views - 1
-    return lines.n_readings - of_plate - lines.n_determined
 
 
 def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
