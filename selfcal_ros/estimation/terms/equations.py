@@ -76,9 +76,12 @@ class ReducedColumns:
         return self.shapes.products(self.inner)
 
 
-@lru_cache(maxsize=2)
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
-    """Return columns with the sites eliminated; the last ones are kept."""
+    """Return columns with the sites eliminated; the last ones are kept, and the grid with them."""
+    return (_last_reduced if shapes.n else _reduced)(grid, shapes)
+
+
+def _reduced(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     sites: np.ndarray = np.zeros((grid.n_sites, 0), dtype=complex)
     inner: np.ndarray = np.zeros((0, 0), dtype=complex)
     coupling: np.ndarray = np.zeros((2 * grid.n_views, 0), dtype=complex)
@@ -87,6 +90,9 @@ def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
         inner -= grid.factor.products(sites)
         coupling -= _coupled(grid, sites)
     return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2, coupling)
+
+
+_last_reduced = lru_cache(maxsize=2)(_reduced)
 
 
 def _marks_eliminated(
