@@ -142,6 +142,30 @@ class GridVisits:
     sigma_m: float = float("nan")
     dof: int = 0
 
+    def shares(self, n_marks: int) -> np.ndarray:
+        """Return the part that each visit has in the mean of its mark, (V,).
+
+        By 1/u^2 if all visits of the mark declare u, else by repeats.
+        """
+        weight = self.count.astype(float)
+        if len(self.u):
+            is_stated = np.isfinite(self.u) & (self.u > 0)
+            least = np.full(n_marks, np.inf)
+            np.minimum.at(least, self.mark, np.where(is_stated, self.u, 0.0))
+            of_mark = least[self.mark]  # 0 if a visit of the mark states none
+            ratio = of_mark / np.where(is_stated, self.u, 1.0)
+            weight = np.where(of_mark > 0, ratio**2, weight)
+        return weight / np.bincount(self.mark, weight)[self.mark]
+
+    def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
+        """Return the means over the visits of each mark of complex values (V,), (n_marks,)."""
+        shares = self.shares(n_marks)
+        x, y = (
+            np.bincount(self.mark, shares * part, n_marks)
+            for part in (values.real, values.imag)
+        )
+        return x + 1j * y
+
     def of_marks(self, keep: np.ndarray) -> "GridVisits":
         """Return the visits of the marks where `keep` (P,) is true, renumbered."""
         stay = keep[self.mark]

@@ -505,22 +505,11 @@ def with_offsets(
     back : float array (2, 2)
         Slope of the other offsets on these.
     """
-    weight = visits.count
-    if len(visits.u) and np.isfinite(visits.u).all() and (visits.u > 0).all():
-        least = np.full(len(view.m), np.inf)
-        np.minimum.at(least, visits.mark, visits.u)
-        weight = (
-            least[visits.mark] / visits.u
-        ) ** 2  # one of each mark is 1, however small
-    weight = weight / np.bincount(visits.mark, weight)[visits.mark]
-    dx, dy = (
-        np.bincount(visits.mark, weight * component, len(view.m))
-        for component in (change.real, change.imag)
-    )
+    of_mean = visits.means(change, len(view.m))
     return replace(
         view,
-        dx=view.dx + dx,
-        dy=view.dy + dy,
+        dx=view.dx + of_mean.real,
+        dy=view.dy + of_mean.imag,
         motion=_turned_motion(view.motion, back),
         visits=replace(
             visits,

@@ -557,16 +557,11 @@ class SeenMicroscope:
         missing = (
             complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
         )
-        number = np.bincount(visits.mark, visits.count, len(view.m))
-        dx, dy = (
-            np.bincount(visits.mark, visits.count * coordinate, len(view.m))
-            / np.maximum(number, 1)
-            for coordinate in (missing.real, missing.imag)
-        )
+        of_mean = visits.means(missing, len(view.m))
         return replace(
             view,
-            dx=view.dx + dx,
-            dy=view.dy + dy,
+            dx=view.dx + of_mean.real,
+            dy=view.dy + of_mean.imag,
             visits=replace(
                 visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag
             ),

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import Pose
-from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE
 from selfcal_ros.model.view import placings_of
 
@@ -130,9 +130,7 @@ def _visits_of(
     if visits is None or not len(visits.mark) or ends is None:
         return None
     mark = flat[visits.mark]
-    visit_weight = _visit_weights(visits, mark, grid.y[row].size)
-    total = np.bincount(mark, visit_weight, grid.y[row].size)
-    weight = visit_weight / total[mark] * grid.weight[row].reshape(-1)[mark]
+    weight = visits.shares(len(view.m)) * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
     return ViewVisits(
         mark=mark,
@@ -186,16 +184,6 @@ def check_visits(measurements: Measurements) -> None:
                     "a deviation or offset is not a finite number, or no length of a stage",
                     "remove the visit",
                 )
-
-
-def _visit_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
-    """Return 1/u^2 if all visits of a mark declare u, else the repeats: as for its mean."""
-    count = visits.count.astype(float)
-    if not len(visits.u):
-        return count
-    good = np.isfinite(visits.u) & (visits.u > 0)
-    all_declared = np.bincount(mark, ~good, n_marks)[mark] == 0
-    return np.where(all_declared, 1 / np.where(good, visits.u, 1.0) ** 2, count)
 
 
 def view_time(instants: np.ndarray, first: float, last: float) -> np.ndarray:
