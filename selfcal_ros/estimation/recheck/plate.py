@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import InputError
@@ -423,11 +424,12 @@ def lone_marks(
             continue
         remaining, readable = left
         places = read_marks.marks[readable]
-        beside = places[None] - places[:, None]
-        nearest = np.argsort(np.abs(beside), axis=1)[:, 1 : NEIGHBOURS + 1]
+        points = np.column_stack([places.real, places.imag])
+        _, nearest = KDTree(points).query(points, k=NEIGHBOURS + 1)
+        nearest = nearest[:, 1:]  # the first is the mark itself
         near = remaining[nearest]
         middle = np.median(near.real, axis=1) + 1j * np.median(near.imag, axis=1)
-        step = np.take_along_axis(beside, nearest, axis=1)
+        step = places[nearest] - places[:, None]
         design = np.stack([np.ones_like(step.real), step.real, step.imag], axis=-1)
         plane = (np.linalg.pinv(design)[:, 0] * near).sum(axis=1)
         away = np.minimum(np.abs(remaining - middle), np.abs(remaining - plane))
