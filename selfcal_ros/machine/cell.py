@@ -225,7 +225,7 @@ def _check_settle(cell: Cell, where: str) -> None:
         if length_m >= least_move_m:
             raise InputError(
                 f"{where}: {name}",
-                f"{length_m:g} m would hide a stage that stands still: is it in um?",
+                f"{length_m:g} m would hide a stage that stands still: is it in µm?",
                 f"give m, below {least_move_m:g}",
             )
         if angle >= FIRST_TURN_RAD:

@@ -75,7 +75,7 @@ def test_a_cell_with_all_its_keys(tmp_path):
         ),
         (
             f"{LIMITS}machine: simulated\nsettle: {{arrival: 20}}\n",
-            "settle: arrival: 20 m would hide a stage that stands still: is it in um",
+            "settle: arrival: 20 m would hide a stage that stands still: is it in µm",
         ),
         (
             f"{LIMITS}machine: simulated\nsettle: {{within_theta: 0.5}}\n",
