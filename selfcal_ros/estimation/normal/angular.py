@@ -49,8 +49,6 @@ class AngularSystem(PlateEliminated):
     """
 
     coordinates, of_view = 1, 1
-    is_untested = False
-    """A value at each line needs no test of whether it suffices."""
 
     def __init__(
         self, turns: tuple[float, ...], weight: np.ndarray, *, known_plate: bool = False
@@ -70,6 +68,11 @@ class AngularSystem(PlateEliminated):
     def n_unknowns(self) -> int:
         """Lines of stage and plate."""
         return 2 * self.n_lines
+
+    @property
+    def harmonics_untested(self) -> bool:
+        """Whether no residual shows harmonics that the map lacks; of a value a line none are."""
+        return False
 
     @property
     def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -214,7 +217,7 @@ class HarmonicSystem(AngularSystem):
         return self.n_readings - of_plate - self.n_determined
 
     @property
-    def is_untested(self) -> bool:  # type: ignore[override]
+    def harmonics_untested(self) -> bool:
         """Whether no residual shows harmonics that the series lacks.
 
         Lines read in two views leave fewer numbers than it has coefficients: it follows nearly all.

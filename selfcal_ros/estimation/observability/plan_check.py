@@ -156,7 +156,7 @@ def check_plan(plan: Plan) -> PlanCheck:
     return PlanCheck(
         observability,
         unknown_sites=int((~system.known_sites).sum()),
-        harmonics_untested=system.angular.is_untested,
+        harmonics_untested=system.angular.harmonics_untested,
     )
 
 

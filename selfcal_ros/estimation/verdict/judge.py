@@ -193,7 +193,10 @@ def _failed_tests(
         failed.append(AxesNotMet(size=size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(NotConverged())
-    if solved.model is not None and solved.model.problem.system.angular.is_untested:
+    if (
+        solved.model is not None
+        and solved.model.problem.system.angular.harmonics_untested
+    ):
         failed.append(HarmonicsUntested())
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
