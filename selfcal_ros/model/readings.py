@@ -100,6 +100,32 @@ def _empty(kind: type) -> Any:
     return field(default_factory=lambda: np.zeros(0, dtype=kind))
 
 
+def weights_by_u(
+    mark: np.ndarray, u: np.ndarray, repeats: np.ndarray | float, n_marks: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of readings in the mean of their mark, (n,), and each mark's least u.
+
+    Proportional to 1/u^2 if all readings of the mark state u, and 1 for its best, so that they stay
+    finite; else `repeats`, and the least u is 0.
+
+    Parameters
+    ----------
+    mark : int array (n,)
+        Index of the mark of each reading.
+    u : float array (n,)
+        Stated standard uncertainties, m or rad; 0 or NaN = not stated.
+    repeats : float array (n,) or float
+        Weights without u.
+    n_marks : int
+        Number of marks.
+    """
+    is_stated = np.isfinite(u) & (u > 0)
+    least = np.full(n_marks, np.inf)
+    np.minimum.at(least, mark, np.where(is_stated, u, 0.0))
+    ratio = least[mark] / np.where(is_stated, u, 1.0)
+    return np.where(least[mark] > 0, ratio**2, repeats), least
+
+
 @dataclass(frozen=True, eq=False)
 class GridVisits:
     """Visits of grid marks in one view: successive readings of a mark, no other mark in between.
@@ -149,12 +175,7 @@ class GridVisits:
         """
         weight = self.count.astype(float)
         if len(self.u):
-            is_stated = np.isfinite(self.u) & (self.u > 0)
-            least = np.full(n_marks, np.inf)
-            np.minimum.at(least, self.mark, np.where(is_stated, self.u, 0.0))
-            of_mark = least[self.mark]  # 0 if a visit of the mark states none
-            ratio = of_mark / np.where(is_stated, self.u, 1.0)
-            weight = np.where(of_mark > 0, ratio**2, weight)
+            weight, _ = weights_by_u(self.mark, self.u, weight, n_marks)
         return weight / np.bincount(self.mark, weight)[self.mark]
 
     def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from selfcal_ros.model.readings import GridVisits, RepeatMotion
+from selfcal_ros.model.readings import GridVisits, RepeatMotion, weights_by_u
 
 PART = 32_768
 """Numbers that are worked on together where marks do not depend on each other: they stay in the
@@ -153,15 +153,8 @@ def average(
     `companions` (e, n) are averaged likewise, without effect on the repeatability.
     """
     marks, inverse, count = _distinct(key)
-    declared = np.bincount(inverse, sigma > 0, len(marks)) == count
-    # weights relative to a mark's best reading stay finite
-    best = np.full(len(marks), np.inf)
-    np.minimum.at(best, inverse, sigma)
-    weight = np.where(
-        declared[inverse] & (sigma > 0),
-        (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2,
-        1.0,
-    )
+    weight, best = weights_by_u(inverse, sigma, 1.0, len(marks))
+    declared = best > 0
     total = np.bincount(inverse, weight, len(marks))
     mean = _means(values, weight, inverse, total)
     residual = values - mean[:, inverse]
