@@ -22,7 +22,7 @@ def tidy(value: float) -> float:
     return float(f"{value:.14g}") + 0.0
 
 
-def plain(value: float) -> str:
+def decimal(value: float) -> str:
     """Return the shortest decimal number that reads back as `value`, without exponent."""
     return np.format_float_positional(value, trim="-")
 

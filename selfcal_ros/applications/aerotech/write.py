@@ -20,7 +20,7 @@ from selfcal_ros.applications.aerotech.model import (
 )
 from selfcal_ros.applications.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.applications.aerotech.rules import check_tables
-from selfcal_ros.compensation.export import comment_text, plain
+from selfcal_ros.compensation.export import comment_text, decimal
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import has_content, refuse_existing, write_together
@@ -59,7 +59,7 @@ def cal_text(
         lines += _head(table)
         values = table.values.reshape(len(table.values), -1)
         if decimals is None:
-            lines += [" ".join(map(plain, row)) for row in values.tolist()]
+            lines += [" ".join(map(decimal, row)) for row in values.tolist()]
         else:
             row_format = " ".join([f"%.{decimals}f"] * values.shape[1])
             lines += [
@@ -106,8 +106,8 @@ def _head(table: Table) -> list[str]:
             str(table.row_axis),
             str(table.column_axis),
             *map(str, table.outputs[:2]),
-            plain(table.sample_row),
-            plain(table.sample_col),
+            decimal(table.sample_row),
+            decimal(table.sample_col),
             str(table.values.shape[1]),
         ]
     lines = [f"{start} {' '.join(arguments)}"]
@@ -127,9 +127,11 @@ def _head(table: Table) -> list[str]:
 def _argument(value: float | int | str | Unit) -> str:
     if isinstance(value, Unit):
         return (
-            value.word if value.divisor == 1 else f"{value.word}/{plain(value.divisor)}"
+            value.word
+            if value.divisor == 1
+            else f"{value.word}/{decimal(value.divisor)}"
         )
-    return plain(value) if isinstance(value, float) else str(value)
+    return decimal(value) if isinstance(value, float) else str(value)
 
 
 def write_cals(

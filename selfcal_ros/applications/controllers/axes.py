@@ -24,7 +24,7 @@ from selfcal_ros.applications.controllers.grid import (
     wanted,
 )
 from selfcal_ros.applications.controllers.planes import Texts
-from selfcal_ros.compensation.export import plain
+from selfcal_ros.compensation.export import decimal
 from selfcal_ros.compensation.residual import Correction
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
@@ -117,9 +117,9 @@ def write_siemens(error_map: ErrorMap, wiring: Wiring) -> Texts:
             settings = (
                 f"(AX{source})",
                 f"(AX{output})",
-                plain(spacing(positions)),
-                plain(positions[0]),
-                plain(positions[-1]),
+                decimal(spacing(positions)),
+                decimal(positions[0]),
+                decimal(positions[-1]),
                 "0",
                 "0",
                 "0",

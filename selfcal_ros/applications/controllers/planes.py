@@ -25,7 +25,7 @@ from selfcal_ros.applications.controllers.grid import (
     spacing,
     wanted,
 )
-from selfcal_ros.compensation.export import plain
+from selfcal_ros.compensation.export import decimal
 from selfcal_ros.compensation.residual import Correction, Covering
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
@@ -50,8 +50,8 @@ def write_kmotion(error_map: ErrorMap, wiring: Wiring) -> Texts:
     cx, cy = wanted(error_map, wiring)(px, py)
     lines = [
         f"{len(y)},{len(x)}",
-        f"{plain(spacing(x))},{plain(spacing(y))}",
-        f"{plain(x[0])},{plain(y[0])}",
+        f"{decimal(spacing(x))},{decimal(spacing(y))}",
+        f"{decimal(x[0])},{decimal(y[0])}",
     ]
     lines += [
         f"{row},{column},{fixed(px[row, column] + cx[row, column], unit_m)},"

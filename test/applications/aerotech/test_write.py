@@ -16,7 +16,7 @@ from selfcal_ros.applications.aerotech.model import (
 )
 from selfcal_ros.applications.aerotech.read import parse_cal
 from selfcal_ros.applications.aerotech.write import cal_text, write_cals
-from selfcal_ros.compensation.export import plain
+from selfcal_ros.compensation.export import decimal
 from selfcal_ros.errors import InputError
 from selfcal_ros.outputs import write_together
 from test.support.cal_tables import tables_1d, tables_2d, tables_galvo
@@ -41,7 +41,7 @@ def test_read_write_read_keeps_the_meaning_in_strict_form(tables):
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_decimals_read_back_exactly_and_have_no_exponent(value):
-    assert float(plain(value)) == value and "e" not in plain(value)
+    assert float(decimal(value)) == value and "e" not in decimal(value)
 
 
 def test_a_given_number_of_decimals_rounds_and_has_no_minus_zero():
