@@ -423,17 +423,7 @@ def lone_marks(
         if left is None or len(left[0]) <= NEIGHBOURS:
             continue
         remaining, readable = left
-        places = read_marks.marks[readable]
-        points = np.column_stack([places.real, places.imag])
-        _, nearest = KDTree(points).query(points, k=NEIGHBOURS + 1)
-        nearest = nearest[:, 1:]  # the first is the mark itself
-        near = remaining[nearest]
-        middle = np.median(near.real, axis=1) + 1j * np.median(near.imag, axis=1)
-        step = places[nearest] - places[:, None]
-        design = np.stack([np.ones_like(step.real), step.real, step.imag], axis=-1)
-        plane = (np.linalg.pinv(design)[:, 0] * near).sum(axis=1)
-        away = np.minimum(np.abs(remaining - middle), np.abs(remaining - plane))
-        spread = np.sort(np.abs(near - middle[:, None]), axis=1)[:, AGREEING - 1]
+        away, spread = _beside_neighbours(read_marks.marks[readable], remaining)
         over = away / (2 * BEYOND * np.hypot(spread, read_marks.u))
         m, n = view.m[readable], view.n[readable]
         found += [
@@ -441,6 +431,27 @@ def lone_marks(
             for i in np.flatnonzero(over > 1)
         ]
     return sorted(found, key=lambda lone: -lone.over)
+
+
+def _beside_neighbours(
+    places: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far each complex value is from those of its neighbours, and how far they differ.
+
+    From their median, or from the plane through them if that is nearer, (n,); and the largest
+    distance from the median of the `AGREEING` nearest to it, (n,).
+    """
+    points = np.column_stack([places.real, places.imag])
+    _, nearest = KDTree(points).query(points, k=NEIGHBOURS + 1)
+    nearest = nearest[:, 1:]  # the first is the mark itself
+    near = values[nearest]
+    middle = np.median(near.real, axis=1) + 1j * np.median(near.imag, axis=1)
+    step = places[nearest] - places[:, None]
+    design = np.stack([np.ones_like(step.real), step.real, step.imag], axis=-1)
+    plane = (np.linalg.pinv(design)[:, 0] * near).sum(axis=1)
+    away = np.minimum(np.abs(values - middle), np.abs(values - plane))
+    of_neighbours = np.sort(np.abs(near - middle[:, None]), axis=1)
+    return away, of_neighbours[:, AGREEING - 1]
 
 
 def _read(
