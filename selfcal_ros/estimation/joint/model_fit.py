@@ -38,7 +38,7 @@ from selfcal_ros.estimation.joint.problem import (
     sigma_of,
 )
 from selfcal_ros.estimation.lattice.maps import MapSpline
-from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, MAX_STEPS, ROUNDED
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS, ROUNDED
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import (
@@ -497,55 +497,12 @@ class FinerEquations(PlacedEquations):
     def rank_grid(self) -> int:
         """Rank of the grid readings, coefficients counted as far as they are determined."""
         of_plate = 2 * int(self.grid.mark_read.sum())
-        return round(determined_coefficients(self)) + of_plate + self.rank_schur
-
-
-def determined_coefficients(system: PlacedEquations) -> float:
-    """Return the real coefficients of a map that the readings determine."""
-    grid = system.grid
-    return 2 * (grid.n_sites - grid.vague * float(grid.variance_of_sites.sum()))
+        return round(self.determined_coefficients) + of_plate + self.rank_schur
 
 
 def placed(problem: Problem) -> PlacedEquations | None:
     """Return the equations of a map with nodes of its own; None on the lattice."""
     return problem.system if isinstance(problem.system, PlacedEquations) else None
-
-
-def is_too_large(system: PlacedEquations) -> bool:
-    """Return whether a map has too many nodes for a finer one."""
-    return math.prod(system.grid.views.spline.refined.shape) > MAX_FULL
-
-
-def equations_left(grid: PlacedSystem) -> int:
-    """Return the readings of a map beyond plate and misalignments: two numbers each."""
-    return (
-        2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (grid.n_misalignments - 7)
-    )
-
-
-def is_untested(problem: Problem) -> bool:
-    """Return whether no finer map can test the nodes of a map, if it has nodes of its own."""
-    system = placed(problem)
-    if system is None or is_too_large(system):
-        return system is not None
-    views = system.grid.views
-    n_left = equations_left(system.grid)
-    if views.spline.axes[0].degree == 1 or n_left > 2 * math.prod(
-        views.spline.refined.shape
-    ):
-        return False
-    fine = PlacedSystem(
-        views.artifact, views.poses, system.grid.weight, views.spline.refined
-    )
-    return (
-        n_left
-        - determined_coefficients(
-            PlacedEquations(
-                fine, system.angular, system.grid_index, system.angular_index
-            )
-        )
-        < 1
-    )
 
 
 def finer(model: ModelFit) -> ModelFit | None:
@@ -555,7 +512,7 @@ def finer(model: ModelFit) -> ModelFit | None:
     refined. None on the lattice, for a map that is too large, or if no reading is left to test it.
     """
     system = placed(model.problem)
-    if system is None or is_too_large(system):
+    if system is None or system.grid.too_large_to_refine:
         return None
     views = system.grid.views
     splines = [views.spline.refined]

@@ -9,6 +9,7 @@ the datum is below `KNOWN` readings' noise; the datum is that of the known nodes
 Equations are made once for each plan, planned or measured, and kept.
 """
 
+import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import cast
@@ -59,6 +60,9 @@ class NormalEquations:
     grid_index, angular_index : tuple of int
         Position of their views in the measurement.
     """
+
+    nodes_untested = False
+    """Whether no finer map can test the nodes of the map: a lattice has none of its own."""
 
     def __init__(
         self,
@@ -527,6 +531,17 @@ class PlacedSystem(GridSystem):
         return over_nodes(rows, self.weight, self.relative_weight)
 
     @property
+    def too_large_to_refine(self) -> bool:
+        """Whether the map has too many nodes for one with twice as many intervals."""
+        return math.prod(self.views.spline.refined.shape) > MAX_FULL
+
+    @property
+    def equations_of_map(self) -> int:
+        """The readings beyond plate and misalignments: two numbers each."""
+        n_marks = int(self.mark_read.sum())
+        return 2 * self.n_readings - 2 * n_marks - (self.n_misalignments - 7)
+
+    @property
     def vague(self) -> float:
         """Information added to every node: too little to change a known one."""
         return float(ROUNDED * self.weight.sum() / self.n_sites)
@@ -564,6 +579,28 @@ class PlacedEquations(NormalEquations):
     """Grid and angular equations of one measured plan whose views lie anywhere."""
 
     grid: PlacedSystem
+
+    @property
+    def determined_coefficients(self) -> float:
+        """The real coefficients of the map that the readings determine."""
+        grid = self.grid
+        return 2 * (grid.n_sites - grid.vague * float(grid.variance_of_sites.sum()))
+
+    @cached_property
+    def nodes_untested(self) -> bool:  # type: ignore[override]
+        """Whether no finer map can test the nodes: it is too large, or has too few readings."""
+        grid = self.grid
+        spline = grid.views.spline
+        if grid.too_large_to_refine:
+            return True
+        n_left = grid.equations_of_map
+        if spline.axes[0].degree == 1 or n_left > 2 * math.prod(spline.refined.shape):
+            return False
+        fine = PlacedSystem(
+            grid.views.artifact, grid.views.poses, grid.weight, spline.refined
+        )
+        finer = PlacedEquations(fine, self.angular, self.grid_index, self.angular_index)
+        return n_left - finer.determined_coefficients < 1
 
     @cached_property
     def hides_fields(self) -> bool:

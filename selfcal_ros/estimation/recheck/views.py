@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.comparison.covariance import unit_rows
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.model_fit import determined_coefficients, placed
+from selfcal_ros.estimation.joint.model_fit import placed
 from selfcal_ros.estimation.joint.problem import Moving, NoiseEstimate, Problem
 from selfcal_ros.estimation.normal.angular import FLOOR, GAP, MAX_STEPS, AngularSystem
 from selfcal_ros.estimation.normal.equations import pseudo_inverse
@@ -247,7 +247,7 @@ class PlateReadings:
         rank = (
             system.rank_grid
             if on_map is None
-            else (round(determined_coefficients(on_map)) + on_map.rank_schur)
+            else (round(on_map.determined_coefficients) + on_map.rank_schur)
         )
         return 2 * system.grid.n_readings - rank
 

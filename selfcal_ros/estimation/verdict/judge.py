@@ -28,7 +28,7 @@ from selfcal_ros.estimation.checks.wiring import (
     sign_of_lines_is_shown,
 )
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
-from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
+from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -147,7 +147,7 @@ def judged(
         causes,
         enlargements(result, searched.terms, shown_effects),
     )
-    untested = solved.model is not None and is_untested(solved.model.problem)
+    untested = solved.model is not None and solved.model.problem.system.nodes_untested
     result = replace(
         result,
         verdict=verdict,

@@ -17,9 +17,6 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import (
     ModelFit,
-    determined_coefficients,
-    equations_left,
-    is_too_large,
     placed,
     with_map,
 )
@@ -111,7 +108,7 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         A fit; finite rotations and terms are taken off its readings.
     """
     system = placed(model.problem)
-    if system is None or is_too_large(system):
+    if system is None or system.grid.too_large_to_refine:
         return None
     grid = system.grid
     coarse = _of_marks(model)
@@ -119,9 +116,9 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if refit is None:
         return None
     fine = _of_marks(refit)
-    n = [determined_coefficients(equations) for equations in (fine, coarse)]
+    n = [equations.determined_coefficients for equations in (fine, coarse)]
     squares_coarse, squares_refit = _squares(coarse, model.y), _squares(fine, refit.y)
-    readings = equations_left(grid)
+    readings = grid.equations_of_map
     n_further = n[0] - n[1]
     dof = readings - n[0]
     p = 1.0
