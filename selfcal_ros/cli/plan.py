@@ -56,6 +56,10 @@ HARMONICS_UNTESTED = (
     "the views of lines do not show whether the harmonics of the angular map suffice, and the "
     "result will not be qualified: read the lines in a further view at another turn"
 )
+NODES_UNTESTED = (
+    "the readings do not show whether the nodes of the map suffice, and the result will not be "
+    "qualified: read every mark twice (repeats: 2), or give the map fewer nodes"
+)
 NODES_ONLY = (
     "every reading lies at a node of the map: to test the error between nodes, give the "
     "map its own nodes (map:) and add a view shifted by half a pitch"
@@ -277,6 +281,7 @@ def _check_json(
         "unchecked_sites": observability.unchecked_sites,
         "unchecked_lines": observability.unchecked_lines,
         "harmonics_untested": checked.harmonics_untested,
+        "nodes_untested": checked.nodes_untested,
     }
     if predicted is not None:
         out["predicted"] = plain(
@@ -327,6 +332,7 @@ def _check_text(
     lines += [
         _known_text(plan, checked.unknown_sites),
         *([HARMONICS_UNTESTED] if checked.harmonics_untested else []),
+        *([NODES_UNTESTED] if checked.nodes_untested else []),
         *_unchecked_text(observability),
         _check_stops_text(plan),
         *([] if artifact.map_grid else [NODES_ONLY]),

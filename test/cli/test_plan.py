@@ -151,7 +151,8 @@ def test_nodes_that_stay_unknown_are_counted(tmp_path, capsys):
         in capsys.readouterr().out
     )
     assert main(["simulate", str(tmp_path / "spec.yaml"), "-o", bag]) == 0
-    assert main(["solve", bag, "-o", out, "--model", "none"]) == 0
+    # neither repeats nor a finer map test the nodes
+    assert main(["solve", bag, "-o", out, "--model", "none"]) == 5
     assert "Calibrated at 45 of 81 sites from 3 views" in capsys.readouterr().out
     assert (
         np.isnan(np.array(read_json(out)["error_map"]["gx"], dtype=float)).sum() == 36
@@ -777,3 +778,29 @@ def test_a_plan_whose_harmonics_nothing_tests_says_so_before_it_is_measured(
         assert (said in capsys.readouterr().out) is is_said
         main(["plan", "check", str(path), "--json"])
         assert json.loads(capsys.readouterr().out)["harmonics_untested"] is is_said
+
+
+def test_a_plan_whose_nodes_nothing_tests_says_so_before_it_is_measured(
+    tmp_path, capsys
+):
+    data = {
+        "plan_id": "fine",
+        "artifact": {"grid_size": 23, "grid_pitch": 0.01, "angular_count": 0},
+        "map": {"grid_size": 19},
+        "views": [
+            {"name": "as_it_is"},
+            {"name": "turned", "rotation_deg": 90},
+            {"name": "shifted", "rotation_deg": 37, "translation_pitch": [0.6, -0.7]},
+        ],
+    }
+    said = "do not show whether the nodes of the map suffice"
+    path = tmp_path / "plan.yaml"
+    for repeats, nodes, is_said in ((1, 19, True), (2, 19, False), (1, 17, False)):
+        for view in data["views"]:
+            view["repeats"] = repeats
+        data["map"]["grid_size"] = nodes
+        path.write_text(yaml.safe_dump(data))
+        assert main(["plan", "check", str(path)]) == 0
+        assert (said in capsys.readouterr().out) is is_said
+        main(["plan", "check", str(path), "--json"])
+        assert json.loads(capsys.readouterr().out)["nodes_untested"] is is_said

@@ -12,6 +12,7 @@ from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.roughness import adequacy_of, known_places
 from selfcal_ros.model.artifact import Interpolation, MapGrid
+from selfcal_ros.model.findings import RoughnessUntested
 from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Sense, subset
@@ -346,28 +347,62 @@ def test_readings_are_turned_back_into_the_stage_frame(turn):
     assert change[at] == pytest.approx(1e-6, abs=0.1e-6)
 
 
-@pytest.mark.parametrize(("nodes", "said"), [(17, False), (19, True)])
-def test_a_map_of_too_many_nodes_says_that_their_number_was_not_tested(nodes, said):
-    measurements, _ = readings(plate(23, nodes), THREE, np.random.default_rng(1))
-    found = calibrate(measurements, Options(assumed=())).findings
-    assert ("roughness_untested" in [finding.name for finding in found]) is said
+def repeated(measurements, sigma, repeats=3):
+    """Return readings that are means of so many repeats with a scatter of sigma, m."""
+    views = [
+        replace(
+            view,
+            count=np.full(len(view.m), repeats),
+            sigma_xy=sigma,
+            dof_xy=2 * (repeats - 1) * len(view.m),
+        )
+        for view in measurements.views
+    ]
+    return replace(measurements, views=tuple(views))
+
+
+@pytest.mark.parametrize(("nodes", "untested"), [(17, False), (19, True)])
+def test_a_map_of_too_many_nodes_is_tested_by_repeats_alone(nodes, untested):
+    """Ripples that its nodes do not follow: no finer map shows them, but repeats do."""
+    sigma = 20e-9
+    ripple = 2 * np.pi / (1.6 * 22 / (nodes - 1) * 10e-3)
+    measurements, _ = readings(
+        plate(23, nodes),
+        SIX,
+        np.random.default_rng(1),
+        sigma=sigma / np.sqrt(3),
+        stage=lambda z: (
+            40e-9 * (np.sin(ripple * z.real) + 1j * np.cos(ripple * z.imag))
+        ),
+    )
+    once = calibrate(measurements, Options()).verdict
+    assert (RoughnessUntested() in once.failed) is untested
+    assert ("roughness" in [cause.name for cause in once.causes]) is not untested
+    verdict = calibrate(repeated(measurements, sigma), Options()).verdict
+    assert RoughnessUntested() not in verdict.failed
+    assert "noise_contradicted" in [finding.name for finding in verdict.failed]
 
 
 @pytest.mark.parametrize(
-    ("poses", "said"),
+    ("poses", "untested"),
     [
         (((0, (0, 0)), (5, (0, 0)), (0, (1, 0))), True),
         (((0, (0, 0)), (5, (0, 0)), (0, (1, 0)), (90, (0, 0))), False),
     ],
 )
-def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, said):
+def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, untested):
     """A finer map of 15 x 15 nodes has 450 unknowns, and three views 460 equations for it."""
     measurements, _ = readings(plate(11, 9), poses, np.random.default_rng(5))
-    result = calibrate(measurements, Options())
-    assert (
-        "roughness_untested" in [finding.name for finding in result.findings]
-    ) is said
-    assert (adequacy_of(fit_joint(measurements, Options())) is None) is said
+    verdict = calibrate(measurements, Options()).verdict
+    assert (RoughnessUntested() in verdict.failed) is untested
+    assert (adequacy_of(fit_joint(measurements, Options())) is None) is untested
+    # ten marks read twice tell too little of the noise
+    few = replace(repeated(measurements, 20e-9).views[0], dof_xy=20)
+    scarcely = replace(measurements, views=(few, *measurements.views[1:]))
+    failed = calibrate(scarcely, Options()).verdict.failed
+    assert (RoughnessUntested() in failed) is untested
+    exact, _ = readings(plate(11, 9), poses, np.random.default_rng(5), sigma=0.0)
+    assert RoughnessUntested() not in calibrate(exact, BARE).verdict.failed
 
 
 @pytest.mark.parametrize("nodes", ["2", "-7", "7.0", "٧", ""])

@@ -137,11 +137,14 @@ class PlanCheck:
         Sites, or nodes of the map, that remain unknown although the plan identifies the stage.
     harmonics_untested : bool
         Whether the views of lines are too few to show harmonics that the angular map lacks.
+    nodes_untested : bool
+        Whether neither a finer map nor repeats show what the nodes of the map do not follow.
     """
 
     observability: Observability
     unknown_sites: int = 0
     harmonics_untested: bool = False
+    nodes_untested: bool = False
 
 
 @one_thread()
@@ -157,6 +160,8 @@ def check_plan(plan: Plan) -> PlanCheck:
         observability,
         unknown_sites=int((~system.known_sites).sum()),
         harmonics_untested=system.angular.harmonics_untested,
+        nodes_untested=system.nodes_untested
+        and all(view.repeats == 1 for view in plan.views if view.grid),
     )
 
 

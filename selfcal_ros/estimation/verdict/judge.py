@@ -29,8 +29,19 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
-from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
-from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
+from selfcal_ros.estimation.joint.problem import (
+    MIN_REPEAT_DOF,
+    NEGLIGIBLE,
+    SAME,
+    NoiseEstimate,
+    fit,
+)
+from selfcal_ros.estimation.joint.solve import (
+    NEARLY_EXACT_M,
+    Solved,
+    fit_joint,
+    solve_joint,
+)
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.options import Options
@@ -147,7 +158,6 @@ def judged(
         causes,
         enlargements(result, searched.terms, shown_effects),
     )
-    untested = solved.model is not None and solved.model.problem.system.nodes_untested
     result = replace(
         result,
         verdict=verdict,
@@ -155,7 +165,6 @@ def judged(
             *result.findings,
             *_visits_findings(checked),
             *views_findings(measurements),
-            *[RoughnessUntested()] * untested,
             *_without_readings(solved, options),
         ),
         provenance=provenance_of(measurements, options),
@@ -193,14 +202,24 @@ def _failed_tests(
         failed.append(AxesNotMet(size=size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(NotConverged())
-    if (
-        solved.model is not None
-        and solved.model.problem.system.angular.harmonics_untested
-    ):
-        failed.append(HarmonicsUntested())
+    if solved.model is not None:
+        system = solved.model.problem.system
+        if system.nodes_untested and not _test_the_model(solved.xy):
+            failed.append(RoughnessUntested())
+        if system.angular.harmonics_untested:
+            failed.append(HarmonicsUntested())
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
     return failed
+
+
+def _test_the_model(noise: NoiseEstimate) -> bool:
+    """Return whether residuals of marks test the model: noise is known, or there is none."""
+    dof_known = np.inf if np.isfinite(noise.declared) else noise.dof_repeats
+    return (
+        min(dof_known, noise.dof_residuals) >= MIN_REPEAT_DOF
+        or noise.residuals < NEARLY_EXACT_M
+    )
 
 
 def _with_declared_zeros(

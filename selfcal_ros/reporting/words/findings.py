@@ -268,7 +268,8 @@ FIXED: dict[type, str] = {
     RoughnessUntested: (
         "whether the nodes of the map suffice for the stage was not tested, and U has no "
         "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
-        "readings too few, for a finer map; solve with fewer nodes once, or add a view"
+        "readings too few, for a finer map, and no repeats test the residuals; read every mark "
+        "twice, or give the map fewer nodes"
     ),
     HarmonicsUntested: (
         "whether the harmonics of the angular map suffice for the rotary encoder was not tested, "
