@@ -90,7 +90,7 @@ def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
 
 
 def test_there_and_back_is_where_it_was(desk):
-    (desk / "p.csv").write_text("X, Y\n0.011,-0.017\n")
+    (desk / "p.csv").write_text("# one\nX, Y\n # point\n0.011,-0.017\n")
     assert main(["apply", "R.json", "p.csv", "-o", "there.csv"]) == 0
     ((x, y),) = table(desk / "there.csv")[1][:, 2:4]
     (desk / "q.csv").write_text(f"x,y\n{float(x)!r},{float(y)!r}\n")

@@ -230,6 +230,7 @@ HEAD = "x,y,gx,gy,u_gx,u_gy\n"
         ("x,y,gx,gy,u_gx\n", "x.csv:1: no column u_gy"),
         (HEAD, "x.csv: no site has an error and its uncertainty"),
         (HEAD + "0,0,0,0,1\n", "x.csv:2: 5 cells, not 6"),
+        ("# of May\n" + HEAD + "# 1\n0,0,0,0,1\n", "x.csv:4: 5 cells, not 6"),
         (HEAD + "0,0,a,0,1e-8,1e-8\n", "x.csv:2: a cell is not a number"),
         (HEAD + "0,0,1_0e-9,0,1e-8,1e-8\n", "x.csv:2: a cell is not a number"),
         (HEAD + "0,0,0,0,1e-8,0\n", "x.csv:2: u_gy 0 is not a standard uncertainty"),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import csv_cells
+from selfcal_ros.files import csv_rows
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.plain_numbers import number_of
@@ -83,16 +83,9 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
 
 def _rows(text: str, where: str) -> list[_Row]:
     """Return the rows of a table: known columns by name, NaN where empty or missing."""
-    lines = [
-        (f"{where}:{number}", line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip(", ")
-    ]
+    lines = csv_rows(text, where)
     head = (
-        [
-            cell.lower().removesuffix("_m").removesuffix("_rad")
-            for cell in csv_cells(lines[0][1], lines[0][0])
-        ]
+        [cell.lower().removesuffix("_m").removesuffix("_rad") for cell in lines[0][1]]
         if lines
         else []
     )
@@ -104,8 +97,7 @@ def _rows(text: str, where: str) -> list[_Row]:
             "give x, y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes",
         )
     rows = []
-    for place, line in lines[1:]:
-        cells = csv_cells(line, place)
+    for place, cells in lines[1:]:
         if len(cells) != len(head):
             raise InputError(
                 place, f"{len(cells)} cells, not {len(head)}", "correct the line"
