@@ -279,11 +279,13 @@ def run(args: argparse.Namespace) -> int:
     result = _described(args, result, session.lost)
     _write(args, result)
     lines = [*_report(args, result), *lines]
-    if not args.quiet:
+    if args.quiet:
+        lines = []
+    else:
         show(result, args.bag, file_of(args), aside(args))
         lines += _since(result)
-        lines += _budget(result) if args.budget else []
-        print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
+    lines += _budget(result) if args.budget else []
+    print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
 
 

@@ -74,6 +74,12 @@ def solve(path, *options, output=None):
     return main(["solve", str(path), "--quiet", *more, *options])
 
 
+def test_a_budget_that_is_asked_for_is_printed_without_the_summary(bag, capsys):
+    assert solve(bag, "--budget") == 0
+    text = capsys.readouterr().out
+    assert "uncertainty of XY" in text and "Calibrated" not in text
+
+
 def refused(capsys, code, path, *options):
     """Return the one line on stderr of a solve that must end with `code`."""
     assert solve(path, *options) == code
