@@ -12,7 +12,7 @@ from selfcal_ros.cli.terminal import add_json, say, warn
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.reporting.summary.numbers import decimals_for, fixed
+from selfcal_ros.reporting.summary.numbers import with_u
 from selfcal_ros.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
@@ -140,14 +140,12 @@ def run(args: argparse.Namespace) -> int:
 
 def pose_text(camera: "CameraPose", output: str) -> str:
     """Return a camera in one line."""
-    u_turn_deg = math.degrees(camera.u_turn_rad)
+    size = with_u(camera.pixel_size_m / M_PER_UM, camera.u_pixel_size_m / M_PER_UM)
+    turn = with_u(math.degrees(camera.turn_rad), math.degrees(camera.u_turn_rad))
     return (
-        f"{output}: pixel size {camera.pixel_size_m / M_PER_UM:.6g} µm (u "
-        f"{camera.u_pixel_size_m / M_PER_UM:.1g} µm), turn "
-        f"{fixed(math.degrees(camera.turn_rad), decimals_for([u_turn_deg], 1))}° "
-        f"(u {u_turn_deg:.1g}°), "
+        f"{output}: pixel size {size} µm, turn {turn}° (k=1), "
         f"{'mirrored' if camera.mirror else 'not mirrored'}; axes unequal or sheared by "
-        f"{camera.sheared:.1g} (u {camera.u_sheared:.1g}); noise of a mark "
+        f"{with_u(camera.sheared, camera.u_sheared)}; noise of a mark "
         f"{camera.noise_px:.2g} pixels"
     )
 

@@ -17,7 +17,7 @@ from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
 from selfcal_ros.outputs import write_bytes
 from selfcal_ros.portable import ended_by_signals
-from selfcal_ros.reporting.summary.numbers import counted
+from selfcal_ros.reporting.summary.numbers import counted, with_u
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.drawing import circled
@@ -106,7 +106,8 @@ def _try(args: argparse.Namespace) -> int:
             pixels, marks = trial.look()
         except NoDataError:
             if trial.seen is not None:
-                write_bytes(output, circled(trial.seen, [], min(trial.seen.shape) / 10))
+                size_px = trial.mark_pixels or min(trial.seen.shape) / 10
+                write_bytes(output, circled(trial.seen, trial.judged, size_px))
                 tell(f"{output}: what is seen", aside(args))
             raise
         print(
@@ -120,7 +121,7 @@ def _try(args: argparse.Namespace) -> int:
             file=aside(args),
         )
         if pixels is not None:
-            write_bytes(output, circled(pixels, marks, trial.mark_pixels))
+            write_bytes(output, circled(pixels, trial.judged, trial.mark_pixels))
             tell(
                 f"{output}: {counted(len(marks), 'mark')} of {trial.mark_pixels:.3g} pixels in "
                 f"an image of {pixels.shape[1]} x {pixels.shape[0]}",
@@ -149,7 +150,7 @@ def _try(args: argparse.Namespace) -> int:
     )
     lines = [] if outcome.camera is None else [pose_text(outcome.camera, args.cell)]
     lines += [
-        f"backlash of {axis}: {reversal.value / M_PER_UM:.3g} µm (u {reversal.u / M_PER_UM:.1g} µm)"
+        f"backlash of {axis}: {with_u(reversal.value / M_PER_UM, reversal.u / M_PER_UM)} µm (k=1)"
         for axis, reversal in outcome.reversal.items()
     ]
     lines.append(

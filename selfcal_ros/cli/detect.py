@@ -24,7 +24,7 @@ from selfcal_ros.outputs import write_bytes
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
-from selfcal_ros.vision.detector import Judged, Mark
+from selfcal_ros.vision.detector import Judged
 from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
@@ -136,17 +136,11 @@ def _drawn(
     judged: Sequence[Judged],
 ) -> None:
     """Write an image with what was found and what was rejected in it."""
-    marks = [(each.u, each.v) for each in judged if isinstance(each.found, Mark)]
-    rejected = [
-        (each.u, each.v, str(each.found))
-        for each in judged
-        if not isinstance(each.found, Mark)
-    ]
     size = settings.mark_size / settings.pixel_size
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(
         folder / f"{Path(name).stem}.png",
-        circled(picture.values, marks, size, rejected),
+        circled(picture.values, judged, size),
     )
 
 

@@ -15,9 +15,16 @@ from selfcal_ros.machine.interface import Image, Machine, MachineError
 from selfcal_ros.machine.visiting import Visitor
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.settings.detector import DetectorSettings
-from selfcal_ros.units import NS_PER_S, UM_PER_M
+from selfcal_ros.units import NS_PER_S
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
-from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE, MarkDetector
+from selfcal_ros.vision.detector import (
+    LARGEST_SIZE,
+    SMALLEST_SIZE,
+    Judged,
+    MarkDetector,
+    rejected_text,
+    told_apart,
+)
 from selfcal_ros.vision.images import Picture
 from selfcal_ros.vision.shown import spots_in
 
@@ -97,6 +104,8 @@ class Trial:
     ----------
     seen : array (h, w) or None
         The image of `look`, also if it shows no mark.
+    judged : list of Judged
+        The possible marks in it.
     """
 
     cell: Cell
@@ -104,6 +113,7 @@ class Trial:
     clock: Clock = field(default_factory=Clock)
     mark_pixels: float = 0.0
     seen: np.ndarray | None = field(default=None, init=False)
+    judged: list[Judged] = field(default_factory=list, init=False)
 
     def look(self) -> tuple[np.ndarray | None, list[tuple[float, float]]]:
         """Return an image and the columns and rows of its marks; without a camera their offsets, m.
@@ -139,7 +149,8 @@ class Trial:
             )
         picture = visitor.eye.trusted(image_or_offsets, self.position.positions)
         self.seen = picture.values
-        size, marks = self._sized(picture, settings)
+        self.mark_pixels, self.judged = self._sized(picture, settings)
+        marks, rejected = told_apart(self.judged)
         if not marks:
             spots = spots_in(picture.values)
             what = (
@@ -149,11 +160,11 @@ class Trial:
             )
             raise NoDataError(
                 "machine.image",
-                f"no mark is found in the image; {what}",
+                f"no mark is found in the image{rejected_text(rejected)}; {what}",
                 "move to a mark, focus; check mark, polarity and mark_size in CELL.yaml, or give "
                 "--mark-pixels",
             )
-        self.mark_pixels = size
+        size = self.mark_pixels
         in_pixels = replace(
             settings,
             pixel_size=1.0,
@@ -166,31 +177,30 @@ class Trial:
         self._visitor = Visitor(
             self.machine, replace(self.cell, detector=in_pixels), self.clock
         )
-        return picture.values, marks
+        return picture.values, [(mark.u, mark.v) for mark in marks]
 
     def _sized(
         self, picture: Picture, settings: DetectorSettings
-    ) -> tuple[float, list[tuple[float, float]]]:
-        """Return the size of a mark, px, and the places of all, columns and rows."""
+    ) -> tuple[float, list[Judged]]:
+        """Return the size of a mark, px, and the possible marks of that size."""
         known_size_px = self.mark_pixels or (
             settings.mark_size / settings.pixel_size if settings.pixel_size else 0
         )
-        best: tuple[float, float, list[tuple[float, float]]] = (0.0, known_size_px, [])
+        best: tuple[float, float, list[Judged]] = (0.0, known_size_px, [])
         for size in [known_size_px] if known_size_px else _sizes(picture.values.shape):
             width = settings.mark_width * size / settings.mark_size
             detector = MarkDetector(
                 replace(settings, pixel_size=1.0, mark_size=size, mark_width=width),
                 str(self.cell.path),
             )
-            marks, _ = detector.marks(picture)
+            judged = detector.judged(picture)
+            marks, _ = told_apart(judged)
+            if not marks and known_size_px:
+                return size, judged
             score = sum(mark.score for mark in marks) * size
             if score > best[0]:
                 fitted = [mark.fit.shape.get("size", size) for mark in marks]
-                best = (
-                    score,
-                    float(np.median(fitted)),
-                    [(mark.u, mark.v) for mark in marks],
-                )
+                best = (score, float(np.median(fitted)), judged)
         return best[1], best[2]
 
     @property
@@ -369,9 +379,8 @@ def _notes(camera: CameraPose | None, reversal: dict[str, FoundValue]) -> Iterat
     for axis, backlash in reversal.items():
         if abs(backlash.value) > max(SIGMAS * backlash.u, LARGE_REVERSAL_M):
             yield (
-                f"{axis} has a backlash of {backlash.value * UM_PER_M:.3g} µm (u "
-                f"{backlash.u * UM_PER_M:.2g} µm): approach marks from one side, or let the model "
-                "have the term approach; the map holds for one side only"
+                f"{axis} has a backlash: approach marks from one side, or let the model have the "
+                "term approach; the map holds for one side only"
             )
 
 

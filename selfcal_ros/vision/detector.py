@@ -298,8 +298,7 @@ class MarkDetector:
             f"no {'' if self._sign == 0 else settings.polarity + ' '}{settings.mark} of "
             f"{self.size:.3g} px was found"
         )
-        reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
-        summary = none_found + (f"; rejected: {reasons}" if reasons else "")
+        summary = none_found + rejected_text(rejected)
         spots = None if picture is None else spots_in(picture.values)
         if spots is None:
             return f"{summary}; nothing repeats in them", "check exposure and focus"
@@ -309,6 +308,9 @@ class MarkDetector:
         if self._sign and spots.polarity != settings.polarity:
             options.append(f"--polarity {spots.polarity}")
         what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+        if [reason for reason, _ in rejected.most_common(1)] == [MarkFault.DEFOCUSED]:
+            # blurred marks look larger than they are
+            return what, "focus, and take the images again"
         return what, (
             f"try {' '.join(options)}"
             if options
@@ -359,6 +361,12 @@ def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
         else:
             faults[str(candidate.found)] += 1
     return marks, faults
+
+
+def rejected_text(rejected: Counter[str]) -> str:
+    """Return the reasons of rejected marks after a semicolon; nothing if there are none."""
+    reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
+    return f"; rejected: {reasons}" if reasons else ""
 
 
 def _without_doubles(

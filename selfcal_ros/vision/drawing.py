@@ -7,17 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
+from selfcal_ros.vision.detector import Judged, Mark
+
 RADIUS = 0.75
 """Radius of a circle, in sizes of the mark."""
 COLOUR, AXIS, REJECTED = (0, 190, 90), (0, 160, 255), (255, 60, 0)
 
 
-def circled(
-    pixels: np.ndarray,
-    marks: Sequence[tuple[float, float]],
-    size_px: float,
-    rejected: Sequence[tuple[float, float, str]] = (),
-) -> bytes:
+def circled(pixels: np.ndarray, judged: Sequence[Judged], size_px: float) -> bytes:
     """Return an image as PNG, stretched to its range, with a circle around every mark.
 
     A square with a reason stands around what was rejected. A cross shows the optical axis, the
@@ -27,12 +24,10 @@ def circled(
     ----------
     pixels : array (h, w)
         Grey values.
-    marks : sequence of (u, v)
-        Columns and rows of the marks.
+    judged : sequence of Judged
+        The marks, and what was rejected.
     size_px : float
         Size of a mark.
-    rejected : sequence of (u, v, reason)
-        Possible marks that were rejected.
     """
     low, high = float(pixels.min()), float(pixels.max())
     grey = ((pixels - low) * (255 / max(high - low, 1.0))).astype(np.uint8)
@@ -40,17 +35,14 @@ def circled(
     draw = ImageDraw.Draw(picture)
     line = max(1, round(size_px / 12))
     radius = RADIUS * size_px
-    for u, v in marks:
-        draw.ellipse(
-            [u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line
-        )
-    for u, v, reason in rejected:
-        draw.rectangle(
-            [u - radius, v - radius, u + radius, v + radius],
-            outline=REJECTED,
-            width=line,
-        )
-        draw.text((u - radius, v + radius + line), reason, fill=REJECTED)
+    for each in judged:
+        u, v = each.u, each.v
+        square = [u - radius, v - radius, u + radius, v + radius]
+        if isinstance(each.found, Mark):
+            draw.ellipse(square, outline=COLOUR, width=line)
+            continue
+        draw.rectangle(square, outline=REJECTED, width=line)
+        draw.text((u - radius, v + radius + line), str(each.found), fill=REJECTED)
     u = (pixels.shape[1] - 1) / 2
     v = (pixels.shape[0] - 1) / 2
     arm = size_px / 2

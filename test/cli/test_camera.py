@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.writer import BagWriter
@@ -262,11 +263,24 @@ def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
 )
 def test_images_without_the_mark_say_what_they_show(tmp_path, capsys, options, said):
     """And not that the stage is to be moved: the moves are right."""
+    assert said in said_of_images(tmp_path, capsys, *options)
+
+
+def test_blurred_images_are_to_be_focused(tmp_path, capsys):
+    """Blurred marks look larger: their size is right."""
+    said = said_of_images(tmp_path, capsys, blur_px=8)
+    assert "defocused" in said and "; focus, and take the images again" in said
+
+
+def said_of_images(tmp_path, capsys, *options, blur_px=0.0):
+    """Return the line that refuses images as without a mark."""
     for number, values in enumerate(views(Camera(200, 180, pixel_size_m=2.6e-6))):
-        Image.fromarray(values).save(tmp_path / f"{number}.png")
+        blurred = ndimage.gaussian_filter(values, blur_px)
+        Image.fromarray(blurred).save(tmp_path / f"{number}.png")
     rows = [f"{number}.png,{x},{y}" for number, (x, y) in enumerate(MOVES)]
     table = tmp_path / "p.csv"
     table.write_text("\n".join(["file,x,y", *rows]) + "\n")
     assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(table), *options) == 4
     err = capsys.readouterr().err
-    assert said in err and err.count("\n") == 1 and "move the stage" not in err
+    assert err.count("\n") == 1 and "move the stage" not in err
+    return err

@@ -16,7 +16,7 @@ from selfcal_ros.files import read_yaml
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import read_cell
 from selfcal_ros.machine.trying import Trial
-from selfcal_ros.vision.drawing import COLOUR
+from selfcal_ros.vision.drawing import COLOUR, REJECTED
 from test.support.cells import CELL, Jumping, write_cell
 from test.support.faults import Spoilt
 
@@ -74,7 +74,7 @@ def test_camera_and_backlash_are_found_within_their_uncertainty(
     assert abs(found.reversal["y"].value) < max(5 * found.reversal["y"].u, 2e-8)
     notes = " ".join(found.notes)
     assert ("the image is mirrored" in notes) is mirror
-    assert "x has a backlash of" in notes
+    assert "x has a backlash: approach" in notes
     assert "y has a backlash" not in notes
     # after it stands where it stood
     assert np.abs(machine.position()[:2]).max() < 1e-6
@@ -136,6 +136,19 @@ def test_without_a_mark_the_picture_shows_what_is_seen(tmp_path, monkeypatch, ca
     )
     with Pillow.open("cell.seen.png") as picture:
         assert picture.size == (220, 200)
+
+
+def test_the_picture_shows_what_was_rejected_and_the_line_why(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path)
+    assert main(["cell", "try", "cell.yaml", "--yes", "--mark-pixels", "18"]) == 4
+    assert "no mark is found in the image; rejected: 1 wrong_size; what repeats" in (
+        capsys.readouterr().err
+    )
+    with Pillow.open("cell.seen.png") as picture:
+        assert (np.asarray(picture) == REJECTED).all(axis=2).sum() > 50
 
 
 def test_marks_in_another_unit_move_nothing(tmp_path, monkeypatch, capsys):
