@@ -17,6 +17,7 @@ from selfcal_ros.applications.laser.simulation import (
     simulate_step_diagonal,
 )
 from selfcal_ros.parallel import Progress, silent
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, URAD_PER_RAD
 
 STEPS_M = (0.01, 0.01)
@@ -119,8 +120,8 @@ def ibaraki_text(reproduction: IbarakiReproduction) -> str:
         )
     lines += [
         "",
-        f"Table 2 and text: case study, 60 mm, 6 blocks, µm; ours: mean of {n} "
-        "simulated measurements",
+        "Table 2 and text: case study, 60 mm, 6 blocks, µm; ours: mean of "
+        f"{counted(n, 'simulated measurement')}",
         f"{'':16}{'measured':>10}{'new:':>8}{'published':>10}{'ours':>8}"
         f"{'conventional:':>16}{'published':>10}{'ours':>8}",
     ]
