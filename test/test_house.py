@@ -120,14 +120,14 @@ def test_every_module_names_its_licence():
     assert [path for path in SOURCES if not source(path).text.startswith(first)] == []
 
 
-def test_people_read_micrometres():
-    """`um` is what is typed, and what stands in files and names that are ASCII."""
+def test_people_read_micrometres_and_degrees_as_symbols():
+    """`um` and `deg` are what is typed, and what stands in files and names that are ASCII."""
     in_ascii = {"compensation/export.py", "nodes/filling.py"}  # comments; RViz's font
     found = [
         f"{path.relative_to(PACKAGE)}: {line.strip()}"
         for path in SOURCES
         for line in source(path).text.splitlines()
-        if re.search(r"\} um\b|\b(is it|are) in um\b", line)
+        if re.search(r"\} um\b|\b(is it|are) in um\b|[\d}] deg\b", line)
         and str(path.relative_to(PACKAGE)) not in in_ascii
     ]
     assert not found

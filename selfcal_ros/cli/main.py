@@ -46,7 +46,7 @@ NUMBERS = {
     "float": "a number; give it{unit} without a unit, with a decimal point",
     "int": "a whole number",
 }
-UNITS = {"DEG": "deg", "M": "m", "MM": "mm", "PX": "pixels", "S": "s", "UM": "µm"}
+UNITS = {"M": "m", "MM": "mm", "PX": "pixels", "S": "s", "UM": "µm"}
 """What stands for a value in the help -> its unit."""
 EXTRAS = {
     "cv2": "camera",

@@ -597,7 +597,7 @@ def _show_best(
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
         lines.append(
-            f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a:g}, {b:g}]{kind}"
+            f"  {view['name']}: turn {view['rotation_deg']:g}°, shift [{a:g}, {b:g}]{kind}"
         )
     say(
         args,

@@ -342,7 +342,7 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
         f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
         f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
         "one reading;",
-        f"  plates placed within {math.degrees(assumed.turn_rad):g} deg and "
+        f"  plates placed within {math.degrees(assumed.turn_rad):g}° and "
         f"{assumed.away_m * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
         "off the marks, drawn with a fixed seed",
     ]

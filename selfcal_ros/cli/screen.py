@@ -166,9 +166,7 @@ def what_now(picture: dict[str, Any]) -> str:
         pose = (
             ""
             if None in (x, y, turn)
-            else (
-                f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm"
-            )
+            else (f" turned by {turn:g}°{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
         )
         name = command.get("view_name") or health["values"].get("view_name", "")
         return f"Place the plate for view '{name}'{pose}; then press c. {look}".rstrip()

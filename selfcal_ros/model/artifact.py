@@ -67,7 +67,7 @@ class Artifact:
         Distance between neighbouring marks, m.
     angular_count : int
         K, number of angular lines, at least 3; 0 for a plate without them. Lines are read in the
-        views that are turned by a whole number of them: at 90 deg if K is a multiple of 4.
+        views that are turned by a whole number of them: at 90° if K is a multiple of 4.
     grid_size_y : int
         Number of marks along y; 0 means `grid_size`.
     map_grid : MapGrid, optional

@@ -45,7 +45,7 @@ class StagePose(ABC):
     @property
     @abstractmethod
     def turn_deg(self) -> float:
-        """Turn of the plate, counter-clockwise, 0 to 360 deg."""
+        """Turn of the plate, counter-clockwise, 0 to 360°."""
 
     @abstractmethod
     def turned(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +144,7 @@ class LatticePose(StagePose):
 
     @property
     def turn_deg(self) -> int:
-        """Turn of the plate, counter-clockwise: 0, 90, 180 or 270 deg."""
+        """Turn of the plate, counter-clockwise: 0, 90, 180 or 270°."""
         return 90 * self.q
 
     @property
@@ -209,7 +209,7 @@ class PlacedPose(StagePose):
 
     @property
     def turn_deg(self) -> float:
-        """Turn of the plate, counter-clockwise, 0 to 360 deg."""
+        """Turn of the plate, counter-clockwise, 0 to 360°."""
         return round(math.degrees(cmath.phase(self.phase)), 6) % 360
 
     def turned(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -254,8 +254,8 @@ class View:
             raise InputError(
                 where,
                 f"grid marks cannot be measured at a turn of "
-                f"{math.degrees(self.rotation_rad):.6g} deg",
-                f"turn by 90 deg, set grid to false, or place it on the {OFF}",
+                f"{math.degrees(self.rotation_rad):.6g}°",
+                f"turn by 90°, set grid to false, or place it on the {OFF}",
             )
         lines = turn_in_lines(self.rotation_rad, artifact)
         if (
@@ -268,7 +268,7 @@ class View:
             raise InputError(
                 where,
                 "a turn that is not a quarter needs angular lines",
-                "turn by a multiple of 90 deg",
+                "turn by a multiple of 90°",
             )
         return LatticePose(None if quarter is None else quarter % 4, (a, b), lines)
 
@@ -321,8 +321,8 @@ class View:
         if abs(self.rotation_rad) > MAX_TURN_RAD:
             raise InputError(
                 f"{where} rotation",
-                f"{math.degrees(self.rotation_rad):g} deg are many turns of a plate",
-                "give it within 360 deg",
+                f"{math.degrees(self.rotation_rad):g}° are many turns of a plate",
+                "give it within 360°",
             )
         a, b = (value / artifact.grid_pitch_m for value in self.translation_m)
         if max(abs(a), abs(b)) > MAX_SHIFT + 0.5:

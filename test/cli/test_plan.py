@@ -117,7 +117,7 @@ def test_check_in_words(capsys):
     assert "rank 491 of 493 unknowns, 2 undetermined modes" in text
     assert (
         "  - non-orthogonality of the axes" in text
-        and "  - add a view turned by 90 deg" in text
+        and "  - add a view turned by 90°" in text
     )
     assert main(["plan", "check", shipped("hu"), "--map"]) == 0
     text = capsys.readouterr().out

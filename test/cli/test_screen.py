@@ -38,7 +38,7 @@ def told(state: str, message: str = "", level: int = 0, **values: str) -> dict:
     }
 
 
-TURN = "90 deg ↺ counter-clockwise (the corner at the top right goes to the top left)"
+TURN = "90° ↺ counter-clockwise (the corner at the top right goes to the top left)"
 
 
 def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> str:
@@ -373,7 +373,7 @@ def test_a_number_of_views_that_is_none_is_not_shown(views, sentence):
 @pytest.mark.parametrize(
     ("turn", "said"),
     [
-        (0.0, "turned by 0 deg, at"),
+        (0.0, "turned by 0°, at"),
         (
             180.0,
             "↺ counter-clockwise (the corner at the top right goes to the bottom left), at",
@@ -386,7 +386,7 @@ def test_a_number_of_views_that_is_none_is_not_shown(views, sentence):
             -90.0,
             "↻ clockwise (the corner at the top right goes to the bottom right), at",
         ),
-        (15.0, "turned by 15 deg counter-clockwise, at"),
+        (15.0, "turned by 15° counter-clockwise, at"),
     ],
 )
 def test_the_sense_of_a_turn_and_its_corner_are_said(turn, said):

@@ -191,7 +191,7 @@ def test_a_quarter_turn_of_mixed_sides_is_half_a_pitch_beside():
         plan.views[1].on_stage(plan.artifact)
     seen = check_plan(replace(plan, views=(plan.views[0], plan.views[2]))).observability
     assert in_words(seen.advice)[0] == (
-        "add a view turned by 90 deg and shifted by +0.5 pitch along X and +0.5 pitch along Y"
+        "add a view turned by 90° and shifted by +0.5 pitch along X and +0.5 pitch along Y"
     )
     assert check_plan(mixed_plan("0, 90, tx", 8, 5)).observability.identifiable
 

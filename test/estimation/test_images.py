@@ -45,7 +45,7 @@ def test_one_turn_is_not_and_the_other_is_suggested():
     plan = image_plan(7, turns=(0,))
     seen = check_plan(plan).observability
     assert seen.deficiency == 2
-    assert "90 deg" in in_words(seen.advice)[0]
+    assert "90°" in in_words(seen.advice)[0]
     _, ranked = rank_next(plan, criterion="rms", datum=ThetaDatum.ZERO_MEAN)
     assert ranked[0].view.image == plan.views[0].image
     assert ranked[0].score.deficiency == 0

@@ -207,7 +207,7 @@ def test_a_view_that_was_never_read_is_missed_by_name():
         ViewReadings(view.view) if i in gone else view
         for i, view in enumerate(readings.views)
     )
-    with refused("add a view turned by 90 deg"):
+    with refused("add a view turned by 90°"):
         calibrate(replace(readings, views=views), BARE)
 
 

@@ -123,13 +123,13 @@ def test_marks_have_no_sites_between_quarter_turns():
         (
             View("v", -1e300),
             PLATE,
-            "view 'v' rotation: -5.72958e+301 deg are many turns of a plate; give it w",
+            "view 'v' rotation: -5.72958e+301° are many turns of a plate; give it w",
         ),
         (
             View("v", math.radians(15)),
             PLATE,
-            "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by 90 "
-            "deg, set grid to",
+            "view 'v': grid marks cannot be measured at a turn of 15°; turn by 90°, "
+            "set grid to",
         ),
         (
             View("v", math.radians(7), grid=False),
@@ -140,7 +140,7 @@ def test_marks_have_no_sites_between_quarter_turns():
             View("v", math.radians(15), grid=False),
             Artifact(11, 0.01),
             "view 'v': a turn that is not a quarter needs angular lines; turn by a "
-            "multiple of 90 deg",
+            "multiple of 90°",
         ),
     ],
 )

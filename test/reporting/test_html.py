@@ -349,13 +349,11 @@ def test_a_deficient_plan_is_marked_and_comes_first():
         2,
         False,
         (InWords(text="scale difference"),),
-        (InWords(text="add a view turned by 90 deg"),),
+        (InWords(text="add a view turned by 90°"),),
     )
     html = html_of(replace(result, observability=seen))
     assert '<p class="verdict not_qualified">Not a calibration: 2 modes' in html
-    assert html.index("advice: add a view turned by 90 deg") < html.index(
-        "<h2>Map</h2>"
-    )
+    assert html.index("advice: add a view turned by 90°") < html.index("<h2>Map</h2>")
     assert '<p class="verdict good">Calibrated' in html_of(result)
 
 

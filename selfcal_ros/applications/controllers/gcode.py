@@ -431,7 +431,7 @@ class Rewriter:
         if unsure or abs(abs(to_m) - abs(from_m)) > self._tolerance_m / 2:
             self._refuse(
                 f"the arc ends at {abs(to_m) / abs(from_m):.6f} times its radius, "
-                f"after {math.degrees(sweep):.3f} deg",
+                f"after {math.degrees(sweep):.3f}°",
                 "give more digits or a larger --tolerance; write what is as good as straight as G1",
             )
         sagitta = min(1.0, OF_SAMPLES * self._tolerance_m / abs(from_m))

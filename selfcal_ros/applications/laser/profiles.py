@@ -7,7 +7,7 @@ Profile P[j, c]: error in direction c at the end of every block of axis j, from 
 over the nominal positions 0, step, ..., n step. Straightness: peak to valley of a transverse
 profile about its line. Squareness of axes j < c: (slope of P[c, j] over axis c + slope of P[j, c]
 over axis j) times the range of axis c; it is the inclination of axis c towards +j relative to a
-perfect square on axis j, so positive means an angle below 90 deg. It does not depend on the
+perfect square on axis j, so positive means an angle below 90°. It does not depend on the
 orientation of the machine.
 The line is the least-squares line (default) or the line through both ends.
 
@@ -142,7 +142,7 @@ def squareness(
 def squareness_rad(
     result: StepDiagonalResult, line: ReferenceLine = ReferenceLine.LEAST_SQUARES
 ) -> float:
-    """Return the squareness of X and Y as an angle, rad: 90 deg minus that between the axes."""
+    """Return the squareness of X and Y as an angle, rad: 90° minus that between the axes."""
     return slope(result, 1, 0, line) + slope(result, 0, 1, line)
 
 

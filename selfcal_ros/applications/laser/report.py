@@ -35,7 +35,7 @@ CONVENTION = {
     "reading": "positive on every diagonal; np: rx = -l.dx, ry = +l.dy",
     "datum": "turned so that the first X step has no transverse error",
     "squareness": "(slope of the X error over y + slope of the Y error over x) times the Y range; "
-    "positive: the angle between +X and +Y is less than 90 deg",
+    "positive: the angle between +X and +Y is less than 90°",
     "straightness": "peak to valley of the transverse profile about its line",
 }
 

@@ -24,11 +24,12 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
+from selfcal_ros.reporting.summary.numbers import counted, with_u
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 ARTIFACT = Artifact(11, 0.01, 24)
-"""Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg.
+"""Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15°.
 
 Hu prints the pitch as L/N; N marks have N - 1 intervals.
 """
@@ -221,7 +222,7 @@ def hu_text(reproduction: HuReproduction) -> str:
         "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
         "readings at once",
         f"without noise the law errs by {reproduction.noise_free_um:.1e} µm, "
-        f"{reproduction.noise_free_deg:.1e} deg",
+        f"{reproduction.noise_free_deg:.1e}°",
         "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
         "map's error, so that it may lie below",
     ]
@@ -232,20 +233,20 @@ def hu_text(reproduction: HuReproduction) -> str:
 
 def _table_text(run: HuRun, n_draws: int) -> list[str]:
     table = run.published
+    draws = "1 draw" if n_draws == 1 else f"{n_draws} draws, mean ± spread"
     lines = [
-        f"{table.name}: noise {table.sigma_um:g} µm, {table.sigma_deg:g} deg",
-        f"{'':10}{'published':^33} {'law, first draw':^33} "
-        f"{f'std of {n_draws} draws, mean ± spread':^46}",
+        f"{table.name}: noise {table.sigma_um:g} µm, {table.sigma_deg:g}°",
+        f"{'':10}{'published':^33} {'law, first draw':^33} {f'std of {draws}':^46}",
         f"{'':10}{'max':>11}{'min':>11}{'std':>11} {'max':>11}{'min':>11}{'std':>11} "
         f"{'law':>22}{'joint':>22}{'bound':>11}",
     ]
-    names = ("EGx, µm", "EGy, µm", "EGth, deg")
+    names = ("EGx, µm", "EGy, µm", "EGth, °")
     bounds = (run.bound[0], run.bound[0], run.bound[1])
     first = run.law.first
     for row, name in enumerate(names):
         cells = [f"{value:11.4g}" for value in (*table.table[row], *first[row])]
         spreads = [
-            f"{errors.std[:, row].mean():.4g} ± {_spread(errors.std[:, row]):.2g}"
+            with_u(float(errors.std[:, row].mean()), _spread(errors.std[:, row]))
             for errors in (run.law, run.joint)
         ]
         lines.append(
@@ -262,6 +263,7 @@ def _table_text(run: HuRun, n_draws: int) -> list[str]:
 
 
 def _spread(values: np.ndarray) -> float:
+    """Return the standard deviation of single draws; NaN of one draw, which has none."""
     return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
 
 
@@ -271,10 +273,10 @@ def _series_text(run: HuRun) -> list[str]:
         run.published.figures, run.published.n_draws, ((0, 1), (2,)), strict=True
     ):
         lines.append(
-            f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws"
+            f"{figure}: std of the law's error in {counted(min(n, len(run.law.xy)), 'draw')}"
         )
         for column in columns:
-            name = ("x, µm", "y, µm", "theta, deg")[column]
+            name = ("x, µm", "y, µm", "theta, °")[column]
             values = " ".join(
                 f"{value:.2e}" if column == 2 else f"{value:.4f}"
                 for value in run.law.std[:n, column]

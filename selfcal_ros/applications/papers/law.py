@@ -298,8 +298,8 @@ JOINTLY = "solve with --method joint"
 
 _REMEDY = f"measure Hu's four views in full, or {JOINTLY}"
 _NAMES = (
-    "0 deg with grid and lines",
-    "90 deg with grid and lines",
+    "0° with grid and lines",
+    "90° with grid and lines",
     "one line, lines only",
     "one pitch along +X with grid and lines",
 )

@@ -22,6 +22,7 @@ from selfcal_ros.model.error_map import ThetaDatum, datum_modes, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import UM_PER_M
 
@@ -41,8 +42,8 @@ PUBLISHED_MEAN_UM = 0.05
 
 POSES = {
     "initial": (0, 0, 0),
-    "90 deg": (1, 0, 0),
-    "180 deg": (2, 0, 0),
+    "90°": (1, 0, 0),
+    "180°": (2, 0, 0),
     "shift +x": (0, 1, 0),
     "shift -x": (0, -1, 0),
     "shift +y": (0, 0, 1),
@@ -80,25 +81,25 @@ class RankRow:
 
 ROWS = (
     RankRow("initial", (2, 0, 7), 3),
-    RankRow("90 deg", (2, 0, 7), 3),
-    RankRow("180 deg", (2, 0, 7), 3),
+    RankRow("90°", (2, 0, 7), 3),
+    RankRow("180°", (2, 0, 7), 3),
     RankRow("shift +x", (2, -2, 7), 3),
-    RankRow("initial, 90 deg", (3.5, 0, 8.5), 6),
-    RankRow("initial, 180 deg", (3, 0, 9), 6),
+    RankRow("initial, 90°", (3.5, 0, 8.5), 6),
+    RankRow("initial, 180°", (3, 0, 9), 6),
     RankRow("initial, shift +x", (4, -2, 7), 6),
-    RankRow("initial, 90 deg, 180 deg", (3.5, 0, 11.5), 9),
-    RankRow("initial, 90 deg, shift +x", (4, 0, 9), 9),
-    RankRow("initial, 180 deg, shift +x", (4, -1, 10), 9),
+    RankRow("initial, 90°, 180°", (3.5, 0, 11.5), 9),
+    RankRow("initial, 90°, shift +x", (4, 0, 9), 9),
+    RankRow("initial, 180°, shift +x", (4, -1, 10), 9),
     RankRow("initial, shift +x, shift -x", (4, -2, 10), 9),
     RankRow("initial, shift +x, shift +y", (4, 0, 7), 9),
-    RankRow("initial, 90 deg, 180 deg, shift +x", (4, 0, 12), 12),
-    RankRow("initial, 90 deg, shift +x, shift -x", (4, 0, 12), 12),
-    RankRow("initial, 90 deg, shift +x, shift +y", (4, 0, 12), 12),
-    RankRow("initial, 180 deg, shift +x, shift -x", (4, -1, 13), 12),
-    RankRow("initial, 180 deg, shift +x, shift +y", (4, 0, 10), 12),
+    RankRow("initial, 90°, 180°, shift +x", (4, 0, 12), 12),
+    RankRow("initial, 90°, shift +x, shift -x", (4, 0, 12), 12),
+    RankRow("initial, 90°, shift +x, shift +y", (4, 0, 12), 12),
+    RankRow("initial, 180°, shift +x, shift -x", (4, -1, 13), 12),
+    RankRow("initial, 180°, shift +x, shift +y", (4, 0, 10), 12),
     RankRow("initial, shift +x, shift -x, shift +y", (4, 0, 10), 12),
 )
-PROGRAMS = (("initial", "90 deg", "shift +x"), ("initial", "180 deg", "shift +x"))
+PROGRAMS = (("initial", "90°", "shift +x"), ("initial", "180°", "shift +x"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,7 +338,7 @@ def _noise_text(reproduction: QiaoReproduction) -> list[str]:
         rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um)
     )
     return [
-        f"Figure 4: noise of standard deviation 0.1 µm, program 1, {n} draws",
+        f"Figure 4: noise of standard deviation 0.1 µm, program 1, {counted(n, 'draw')}",
         f"  rms error of one draw: x {x:.4f} µm, y {y:.4f} µm; published "
         f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} µm",
         f"  rms over all draws: {over_draws:.4f} µm; published {PUBLISHED_MEAN_UM} µm",

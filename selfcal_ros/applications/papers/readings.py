@@ -138,7 +138,7 @@ def _repeatability(sigma: float, repeats: int) -> float:
 
 
 def hu_plan(artifact: Artifact, repeats: int = 1) -> Plan:
-    """Return Hu's four views: identity, 90 deg, one line (angular only), one pitch along +X."""
+    """Return Hu's four views: identity, 90°, one line (angular only), one pitch along +X."""
     angular = artifact.angular_count > 0
     view = View("identity", angular=angular, repeats=repeats)
     views = [

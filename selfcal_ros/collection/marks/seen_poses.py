@@ -245,7 +245,7 @@ def _fitted(
 
 
 def _turn(turn: complex, pose: StagePose, max_rotation_rad: float) -> float:
-    """Return a turn, 0 to 360 deg: a likely one, if it is within the rotation of a plate."""
+    """Return a turn, 0 to 360°: a likely one, if it is within the rotation of a plate."""
     deg = float(np.degrees(np.angle(turn)))
     likely = (
         pose.turn_deg,

@@ -221,8 +221,8 @@ def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
     if not readings.view.on_stage(artifact).has_sites:
         raise InputError(
             f"view '{readings.view.name}'",
-            "grid marks were read at a turn that is not a multiple of 90 deg",
-            "turn by a multiple of 90 deg",
+            "grid marks were read at a turn that is not a multiple of 90°",
+            "turn by a multiple of 90°",
         )
     return pose_of(readings.view, artifact)
 

@@ -151,7 +151,7 @@ class GridSystem(PlateEliminated):
         """Return G and A with zero mean plate error in each free component.
 
         The linear model does not determine the vector of such a component; a finite rotation
-        turns it, so that 0.4 mm (as left by the pins) gave residuals of 2 um at 0.3 deg.
+        turns it, so that 0.4 mm (as left by the pins) gave residuals of 2 um at 0.3°.
 
         Parameters
         ----------

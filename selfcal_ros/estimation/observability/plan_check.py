@@ -119,7 +119,7 @@ CHECK_MARKS, CHECK_OFFSET_M = 5, 20e-6
 """Suggested check stops: marks per view, and their distance, m."""
 
 OTHER_TURN_DEG = 37
-"""Turn of a usual view of lines for a Fourier map: 360 deg and it have no common factor."""
+"""Turn of a usual view of lines for a Fourier map: 360° and it have no common factor."""
 
 MAX_CURES = 5
 """Largest number of sets of views proposed."""

@@ -75,11 +75,11 @@ def describe_view(view: View, artifact: Artifact) -> str:
         lines = view.on_stage(artifact).turn_lines or 0
         of_lines = "" if artifact.harmonics else f"{lines} line{'s' * (lines != 1)} ("
         description = (
-            f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
+            f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g}°"
             + ")" * bool(of_lines)
         )
     elif 1e-6 < turn < 360 - 1e-6:
-        description = f"a view turned by {turn:.6g} deg"
+        description = f"a view turned by {turn:.6g}°"
     else:
         description = "an unturned view"
     unit, name = (

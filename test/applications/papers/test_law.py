@@ -220,7 +220,7 @@ def test_noise_of_one_reading_from_what_is_left_over():
         ),
         (
             lambda v: (v[0], v[2], v[3]),
-            "Hu's view 1 (90 deg with grid and lines) is missing",
+            "Hu's view 1 (90° with grid and lines) is missing",
         ),
         (
             lambda v: (*v, v[0]),

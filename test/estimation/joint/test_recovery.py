@@ -340,7 +340,7 @@ class TestHostile:
             calibrate(self.readings(dx=np.zeros(24), dy=np.zeros(24)), BARE)
 
     def test_grid_marks_at_an_odd_turn(self):
-        with pytest.raises(InputError, match="not a multiple of 90 deg"):
+        with pytest.raises(InputError, match="not a multiple of 90°"):
             calibrate(self.readings(view=View("identity", np.pi / 4, grid=False)), BARE)
 
     def test_unknown_line(self):

@@ -226,10 +226,10 @@ def test_unseen_modes_in_words():
     ("views", "first"),
     [
         ("0, 90", "add an unturned view shifted by +1 pitch along X"),
-        ("0, tx, ty", "add a view turned by 90 deg"),
+        ("0, tx, ty", "add a view turned by 90°"),
         (
             "0",
-            "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X",
+            "add a view turned by 90° and an unturned view shifted by +1 pitch along X",
         ),
     ],
 )
@@ -309,8 +309,8 @@ def test_candidates_and_their_description():
     views = candidate_views(artifact, angular=True)
     assert len(views) == len({view.name for view in views}) == 21
     texts = [describe_view(view, artifact) for view in views]
-    assert texts[-1] == "an angular view turned by 1 line (45 deg)"
-    assert "a view turned by 270 deg and shifted by -1 pitch along Y" in texts
+    assert texts[-1] == "an angular view turned by 1 line (45°)"
+    assert "a view turned by 270° and shifted by -1 pitch along Y" in texts
     tall = plan_of("0", 5, size_y=9).artifact
     assert all(
         describe_view(view, tall) for view in candidate_views(tall, angular=False)
@@ -357,13 +357,13 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     error = with_advice(refusal.value)
     assert str(error).startswith(
         "the marks that were read do not identify the stage (2 modes undetermined): "
-        "add a view turned by 90 deg; or add a view "
+        "add a view turned by 90°; or add a view "
     )
     assert [mode.name for mode in error.observability.modes] == [
         "nonorthogonality",
         "scale_difference",
     ]
-    assert error.observability.advice[1].text == "or add a view turned by 270 deg"
+    assert error.observability.advice[1].text == "or add a view turned by 270°"
     assert with_advice(error) is error
 
 

@@ -73,11 +73,11 @@ def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
 @pytest.mark.parametrize(
     ("names", "needs"),
     [
-        ("0", "turned by 90 deg"),
+        ("0", "turned by 90°"),
         ("0,90", "1 pitch along X"),
-        ("0,tx", "turned by 90 deg"),
-        ("0,180,tx,ty", "turned by 90 deg"),
-        ("0,tx,ty", "turned by 90 deg"),
+        ("0,tx", "turned by 90°"),
+        ("0,180,tx,ty", "turned by 90°"),
+        ("0,tx,ty", "turned by 90°"),
         ("0,90,180,270", "1 pitch along X"),
     ],
 )
@@ -100,7 +100,7 @@ def test_deficient_plans_are_refused_by_name(names, needs, lines):
 
 def test_a_half_turn_spares_neither_the_quarter_turn_nor_the_shift():
     assert in_words(plan_observability(plan_of("0,180", Artifact(5, 0.01))).advice) == [
-        "add a view turned by 90 deg",
+        "add a view turned by 90°",
         "add an unturned view shifted by +1 pitch along X",
     ]
 
@@ -110,7 +110,7 @@ def test_angular_views_without_a_line_turn_are_refused():
     plan = plan_of("0,90,tx", artifact)
     rng = np.random.default_rng(0)
     readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng)
-    with refused(r"5 modes undetermined.*1 line \(15 deg\)"):
+    with refused(r"5 modes undetermined.*1 line \(15°\)"):
         calibrate(readings)
 
 
@@ -153,8 +153,8 @@ def test_without_a_mark_the_rank_is_that_of_what_is_read():
     [
         (1, []),
         (-1, []),
-        (2, ["add an angular view turned by 1 line (45 deg)"]),
-        (4, ["add an angular view turned by 1 line (45 deg)"]),
+        (2, ["add an angular view turned by 1 line (45°)"]),
+        (4, ["add an angular view turned by 1 line (45°)"]),
     ],
 )
 def test_a_turn_by_one_line_is_advised_where_none_tells_the_lines_apart(lines, more):

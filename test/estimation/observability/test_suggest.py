@@ -123,10 +123,8 @@ def test_next_views_are_ranked_by_what_they_give():
     by_text = {step_text(item, plan): item.score for item in ranked}
     added = by_text["add an unturned view shifted by +1 pitch along Y"]
     assert added.rms_xy == pytest.approx(0.660, abs=5e-4)
-    assert by_text["add a view turned by 180 deg"].rms_xy == pytest.approx(
-        0.763, abs=5e-4
-    )
-    line = by_text["add an angular view turned by 1 line (15 deg)"]
+    assert by_text["add a view turned by 180°"].rms_xy == pytest.approx(0.763, abs=5e-4)
+    line = by_text["add an angular view turned by 1 line (15°)"]
     assert line.rms_xy == pytest.approx(now.rms_xy) and line.rms_theta < now.rms_theta
     again = by_text["measure view 'rot90' 2 times, not 1"]
     assert added.rms_xy < again.rms_xy < now.rms_xy

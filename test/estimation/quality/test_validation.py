@@ -119,7 +119,7 @@ def test_views_that_are_needed_cannot_be_held_out(few_draws):
         assert "does not identify the stage" in notes[f"view '{name}'"]
     assert notes["view 'shift_x'"] == (
         "cannot be held out: the rest does not identify the stage; with a view turned by "
-        "90 deg and shifted by +1 pitch along X measured as well it could be"
+        "90° and shifted by +1 pitch along X measured as well it could be"
     )
     rng = np.random.default_rng(3)
     plan = hu_plan(ARTIFACT)

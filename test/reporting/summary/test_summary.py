@@ -62,7 +62,7 @@ UNSEEN = Observability(
     2,
     False,
     (InWords(text="non-orthogonality"), InWords(text="scale difference")),
-    (InWords(text="add a view turned by 90 deg"),),
+    (InWords(text="add a view turned by 90°"),),
 )
 
 
@@ -224,12 +224,12 @@ def test_state_sentence_of_a_deficient_plan_names_the_missing_view():
     result = replace(known_result()[0], observability=UNSEEN)
     assert state_sentence(result) == (
         "Not a calibration: 2 modes of the stage error cannot be determined from the marks that "
-        "were read; add a view turned by 90 deg."
+        "were read; add a view turned by 90°."
     )
     text = summary_text(result)
     assert "identifiable  NO (rank 5 of 7 unknowns, 2 undetermined modes)" in text
     assert "undetermined mode: scale difference" in text
-    assert "advice: add a view turned by 90 deg" in text
+    assert "advice: add a view turned by 90°" in text
 
 
 def test_state_sentence_without_one_known_site():
