@@ -11,7 +11,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -341,6 +341,27 @@ def plain(value: Any) -> Any:
         finite_numbers = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
         return value.tolist() if finite_numbers else plain(value.tolist())
     return value
+
+
+def filled_fields(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON types, those in it likewise.
+
+    Without those whose default, None, they have: what is not there is left out.
+    """
+    return {
+        field.name: _filled(value)
+        for field in fields(record)
+        if (value := getattr(record, field.name)) is not None
+        or field.default is MISSING
+    }
+
+
+def _filled(value: Any) -> Any:
+    if is_dataclass(value):
+        return filled_fields(value)
+    if isinstance(value, tuple):
+        return [_filled(item) for item in value]
+    return plain(value)
 
 
 def to_ascii(text: str) -> str:

@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
-from typing import Any
+from itertools import compress
+from typing import cast
 
 from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put
 from selfcal_ros.errors import InputError
@@ -14,6 +15,7 @@ from selfcal_ros.estimation.comparison.combine import Member, combine
 from selfcal_ros.estimation.comparison.external import map_from_table
 from selfcal_ros.files import read_text
 from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.parts import Combined, CombinedRun
 from selfcal_ros.model.result import CalibrationResult, created_now, result_to_dict
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.reporting.summary.numbers import p_text
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json and args.output != STDOUT:
         put({"written": args.output, **data["combined"], "verdict": data["verdict"]})
     elif not args.json:
-        print(_text(result, data["combined"]), file=aside(args))
+        print(_text(result), file=aside(args))
     return 0
 
 
@@ -83,44 +85,43 @@ def read_parts(names: Sequence[str]) -> list[Member]:
     ]
 
 
-def _text(result: CalibrationResult, figures: dict[str, Any]) -> str:
+def _text(result: CalibrationResult) -> str:
     emap, noise = result.error_map, result.noise
+    figures = cast(Combined, result.parts.combined)
     u = [rms(emap.u_gx), rms(emap.u_gy)]
     lines = [
-        f"mean of {len(figures['runs'])} maps: {result.verdict.sentence}",
+        f"mean of {len(figures.runs)} maps: {result.verdict.sentence}",
         f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
-        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {figures['u_between_m'] * UM_PER_M:.3g} "
-        f"µm rms, {p_text(figures['p_between'])}",
+        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {figures.u_between_m * UM_PER_M:.3g} "
+        f"µm rms, {p_text(figures.p_between)}",
     ]
-    if "u_between_rad" in figures:
+    if figures.u_between_rad is not None and figures.p_between_theta is not None:
         lines.append(
             f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
             f"rms (k = {noise.k_theta:.3g}), between runs "
-            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
-            f"{p_text(figures['p_between_theta'])}"
+            f"{figures.u_between_rad * ARCSEC_PER_RAD:.3g} arcsec rms, "
+            f"{p_text(figures.p_between_theta)}"
         )
     lines.append("each map against the mean of the others:")
-    for run in figures["runs"]:
+    for run in figures.runs:
         lines.append(
-            f"  {run['file']}: weight {run['weight']:.3f}, |E_n| rms "
-            f"{run['e_n_rms']:.2f}, largest {run['e_n_largest']:.2f}, beyond 1 at "
-            f"{100 * run['beyond']:.1f} %{_p(run['p'])}{_run_text(run)}"
+            f"  {run.file}: weight {run.weight:.3f}, |E_n| rms "
+            f"{run.e_n_rms:.2f}, largest {run.e_n_largest:.2f}, beyond 1 at "
+            f"{100 * run.beyond:.1f} %{_p(run.p)}{_run_text(run)}"
         )
     return "\n".join([*lines, *(f"warning: {line}" for line in result.warnings)])
 
 
-def _p(p: float | None) -> str:
-    return "" if p is None else f", {p_text(p)}"
+def _p(p: float) -> str:
+    return "" if math.isnan(p) else f", {p_text(p)}"
 
 
-def _run_text(run: dict[str, Any]) -> str:
-    parts = [("disagrees in", "agrees"), ("stands out in", "stands_out")]
+def _run_text(run: CombinedRun) -> str:
     words = []
-    for text, key in parts:
-        kinds = [
-            kind
-            for kind, name in (("XY", key), ("theta", f"{key}_theta"))
-            if run.get(name) is (key != "agrees")
-        ]
+    for text, shown in (
+        ("disagrees in", (run.agrees is False, run.agrees_theta is False)),
+        ("stands out in", (run.stands_out, run.stands_out_theta)),
+    ):
+        kinds = list(compress(("XY", "theta"), shown))
         words += [f"{text} {' and '.join(kinds)}"] if kinds else []
     return f": {', '.join(words)}" if words else ""

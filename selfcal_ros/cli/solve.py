@@ -52,7 +52,7 @@ from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.reporting.words.phrases import recheck_lines
 from selfcal_ros.reporting.words.tables import (
     budget_text,
-    validation_json,
+    held_out_figures,
     validation_text,
 )
 from selfcal_ros.settings.estimator import solver_options
@@ -383,10 +383,9 @@ def _validated(
         result = judged_by(result, validation)
         result = replace(
             result,
-            extra={
-                **result.extra,
-                "validation": validation_json(validation, result.plate),
-            },
+            parts=replace(
+                result.parts, validation=held_out_figures(validation, result.plate)
+            ),
         )
         lines += [
             "",

@@ -24,6 +24,7 @@ from selfcal_ros.collection.marks.repeats import (
 from selfcal_ros.collection.marks.rigid import Rigid
 from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.parts import RejectedAt
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
@@ -628,23 +629,18 @@ def with_places(
     result: CalibrationResult, views: Iterable[ViewReadings]
 ) -> CalibrationResult:
     """Return the result with the positions of rejected detections, if any."""
-    places = places_json(views)
-    return (
-        replace(result, extra={**result.extra, "rejected_at": places})
-        if places
-        else result
-    )
-
-
-def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:
-    """Return the positions for ``extra["rejected_at"]`` of a result: one row per view, m."""
-    return [
-        {
-            "view": view.view.name,
-            "reason": list(view.places.reason),
-            "x": view.places.x.round(6),
-            "y": view.places.y.round(6),
-        }
+    rejected_at = tuple(
+        RejectedAt(
+            view.view.name,
+            tuple(view.places.reason),
+            view.places.x.round(6),
+            view.places.y.round(6),
+        )
         for view in views
         if view.places.reason
-    ]
+    )
+    return (
+        replace(result, parts=replace(result.parts, rejected_at=rejected_at))
+        if rejected_at
+        else result
+    )

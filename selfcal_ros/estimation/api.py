@@ -252,8 +252,8 @@ def robust_calibrate(
     Returns
     -------
     CalibrationResult
-        `findings` has what was found, ``extra["outliers"]`` lists the readings removed,
-        ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views; `rejected` counts the
+        `findings` has what was found, ``parts.outliers`` lists the readings removed,
+        ``parts.slips`` and ``parts.noisy_views`` the bad views; `rejected` counts the
         removed detections under ``outlier_among_views``. A fault that could not be corrected
         disqualifies the result.
 
@@ -264,11 +264,7 @@ def robust_calibrate(
     NotIdentifiableError
         As `calibrate`.
     """
-    from selfcal_ros.estimation.quality.outliers import (
-        LEFT,
-        clean,
-        listed,
-    )  # rarely wanted
+    from selfcal_ros.estimation.quality.outliers import LEFT, clean  # rarely wanted
 
     options = replace(options or Options(), robust=True)
     check_wiring(measurements)
@@ -288,7 +284,7 @@ def robust_calibrate(
         result,
         findings=(*result.findings, *cleaned.findings),
         verdict=verdict,
-        extra={**result.extra, **listed(cleaned)},
+        parts=cleaned.with_tables(result.parts),
     )
 
 

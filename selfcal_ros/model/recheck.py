@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recheck finds, a part of its result, and the significance of a difference of maps."""
 
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from selfcal_ros.outputs import plain
+from selfcal_ros.outputs import filled_fields
 
 
 @dataclass(frozen=True)
@@ -160,14 +160,4 @@ class Recheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Return ``recheck`` of RESULT.json."""
-        return {**_filled_fields(self), "calibration": _filled_fields(self.calibration)}
-
-
-def _filled_fields(record: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON values, without those that were left out."""
-    return {
-        field.name: plain(value)
-        for field in fields(record)
-        if (value := getattr(record, field.name)) is not None
-        or field.default is MISSING
-    }
+        return filled_fields(self)

@@ -32,6 +32,7 @@ from selfcal_ros.model.findings import (
     finding_to_dict,
 )
 from selfcal_ros.model.kept import KEYS, Kept, kept_from_dict
+from selfcal_ros.model.parts import PARTS, Parts
 from selfcal_ros.model.plate_form import (
     artifact_of,
     artifact_to_dict,
@@ -191,7 +192,8 @@ class Noise:
 class CalibrationResult:
     """The result of a calibration.
 
-    `kept` is what the covariances of the maps follow from, `extra` tables for reports. `recheck` is
+    `kept` is what the covariances of the maps follow from, `parts` what not every run has, `extra`
+    keys of another program. `recheck` is
     what views of a known plate show to have changed; None of a calibration. `verification` is what
     a correction did that was on, None without one. `camera` and `stage_yaw` are what images of
     several marks show, None without.
@@ -211,6 +213,7 @@ class CalibrationResult:
     warnings: tuple[str, ...] = ()
     method: str = "joint"
     sense: str = "microscope_moves"
+    parts: Parts = Parts()
     extra: dict[str, Any] = field(default_factory=dict)
     kept: Kept = Kept()
     verdict: Verdict = Verdict(Grade.GOOD)
@@ -398,6 +401,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
             if result.verification is None
             else {VERIFICATION: plain(result.verification)}
         ),
+        **result.parts.to_dict(),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -487,6 +491,7 @@ _KNOWN = {
     VERIFICATION,
     DIGEST,
     *KEYS,
+    *PARTS,
 }
 
 
@@ -558,6 +563,7 @@ def _parse(data: dict) -> CalibrationResult:
         warnings=read(tuple[str, ...], data.get("warnings", [])),
         method=read(str, data.get("method", "joint")),
         sense=str(read(Sense, data.get("measurement_sense", "microscope_moves"))),
+        parts=read(Parts, data),
         extra={key: value for key, value in data.items() if key not in _KNOWN},
         kept=kept_from_dict(
             data, artifact.field.shape, artifact.shape, artifact.angular_count

@@ -77,9 +77,10 @@ _SENSE = {
 
 def _tables(result: CalibrationResult) -> dict[str, Any]:
     """Return the tables of a result, with what a correction did that was on."""
-    if result.verification is None:
-        return result.extra
-    return {**result.extra, VERIFICATION: plain(result.verification)}
+    tables = {**result.parts.to_dict(), **result.extra}
+    if result.verification is not None:
+        tables[VERIFICATION] = plain(result.verification)
+    return tables
 
 
 def extra_sections(extra: Mapping[str, Any]) -> list[Section]:

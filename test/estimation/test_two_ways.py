@@ -121,8 +121,8 @@ def test_robust_knows_finite_rotations_of_a_rough_plate():
     )
     bent = with_finite_rotations(readings, truth)
     result = robust_calibrate(bent, BARE)
-    assert result.extra["outliers"]["removed"] == [] and result.extra["slips"] == []
-    assert result.extra["noisy_views"] == []
+    assert result.parts.outliers.removed == () and result.parts.slips == ()
+    assert result.parts.noisy_views == ()
     require_same(maps_of(result), maps_of(calibrate(bent, BARE)))
 
 

@@ -227,6 +227,10 @@ def damaged(path, value):
         (("verification",), "passed", "'passed' is not of type dict"),
         (("verification",), VERIFIED | {"passed": "yes"}, "'yes' is not of type bool"),
         (("verification",), VERIFIED | {"axes": {"x": 0.0}}, "0.0 is not of type dict"),
+        (("residuals",), {"views": "abc"}, "'abc' is not of type list"),
+        (("residuals",), {"views": [{"dx": []}]}, "the key 'view' is missing"),
+        (("rejected_at",), [7], "7 is not of type dict"),
+        (("slips",), {}, "{} is not of type list"),
     ],
 )
 def test_damaged_results_are_refused(path, value, message):

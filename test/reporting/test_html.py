@@ -330,7 +330,7 @@ def test_text_from_files_is_escaped():
         input={"file": evil, evil: evil},
         method=evil,
         sense=evil,
-        extra={evil: evil, "outliers": [{evil: evil}]},
+        extra={evil: evil, "table": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
         observability=Observability(
             1, 2, 1, False, (InWords(text=evil),), (InWords(text=evil),)

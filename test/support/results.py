@@ -10,6 +10,15 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.parts import (
+    Outliers,
+    Parts,
+    RejectedAt,
+    Removed,
+    ResidualsOfViews,
+    ViewCourse,
+    ViewResiduals,
+)
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     ArtifactMap,
@@ -102,39 +111,35 @@ def with_residuals(
     """Return a result that keeps residuals, their course, and places of rejection."""
     result, _ = known_result(size, lines, size_y=size_y)
     rng, shape = np.random.default_rng(2), result.artifact.shape
-    rows = [
-        {
-            "view": v.name,
-            "dx": rng.normal(0, 1e-8, shape),
-            "dy": rng.normal(0, 1e-8, shape),
-            "dtheta": rng.normal(0, 1e-6, lines),
-            "course": {
-                "time_s": np.arange(20.0),
-                "dx": rng.normal(0, 1e-8, 20),
-                "dy": rng.normal(0, 1e-8, 20),
-                "count": np.full(20, 9),
-            },
-        }
+    rows = tuple(
+        ViewResiduals(
+            v.name,
+            dx=rng.normal(0, 1e-8, shape),
+            dy=rng.normal(0, 1e-8, shape),
+            dtheta=rng.normal(0, 1e-6, lines),
+            course=ViewCourse(
+                np.arange(20.0),
+                dx=rng.normal(0, 1e-8, 20),
+                dy=rng.normal(0, 1e-8, 20),
+                count=(9,) * 20,
+            ),
+        )
         for v in result.views
-    ]
-    rejected = [
-        {
-            "view": result.views[0].name,
-            "reason": ["low_score", "too_far_from_nominal"],
-            "x": [0.01, -0.02],
-            "y": [0.02, 0.0],
-        }
-    ]
-    removed = {
-        "removed": [{"view": result.views[1].name, "kind": "grid", "mark": [1, 0]}]
-    }
+    )
+    rejected = RejectedAt(
+        result.views[0].name,
+        ("low_score", "too_far_from_nominal"),
+        np.array([0.01, -0.02]),
+        np.array([0.02, 0.0]),
+    )
+    removed = Removed(result.views[1].name, "grid", (1, 0), 9.0, 0.5, 1e-6)
     return replace(
         result,
-        extra={
-            "residuals": {"views": rows},
-            "rejected_at": rejected,
-            "outliers": removed,
-        },
+        parts=Parts(
+            residuals=ResidualsOfViews(rows),
+            rejected_at=(rejected,),
+            outliers=Outliers("above a limit", 0, (removed,)),
+        ),
     )
 
 

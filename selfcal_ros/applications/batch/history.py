@@ -47,7 +47,7 @@ class Entry:
         """``calibration``, ``recheck`` or ``mean``."""
         if self.result.recheck is not None:
             return "recheck"
-        return "mean" if "combined" in self.result.extra else "calibration"
+        return "mean" if self.result.parts.combined else "calibration"
 
     @property
     def expanded_m(self) -> float:

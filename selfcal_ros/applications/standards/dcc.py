@@ -25,7 +25,7 @@ from selfcal_ros.errors import InputError, printable, visible
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.result import COMBINED, CalibrationResult
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import convention_section, text_of
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
@@ -349,12 +349,12 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
             yield name.replace("_", " "), text_of(value)
     if np.isfinite(provenance.duration_s):
         yield "duration", f"{provenance.duration_s:.0f} s"
-    for run in result.extra.get(COMBINED, {}).get("runs", ()):
+    for run in result.parts.combined.runs if result.parts.combined else ():
         yield (
-            f"readings of {run['file']}",
+            f"readings of {run.file}",
             (
-                f"run {run['run_id'] or 'unknown'}, sha256 {run['sha256'] or 'unknown'}, weight "
-                f"{run['weight']:.3g}"
+                f"run {run.run_id or 'unknown'}, sha256 {run.sha256 or 'unknown'}, weight "
+                f"{run.weight:.3g}"
             ),
         )
     yield from _views(result)

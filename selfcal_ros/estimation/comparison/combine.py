@@ -49,6 +49,7 @@ from selfcal_ros.model.error_map import (
     rms,
 )
 from selfcal_ros.model.findings import BetweenRuns, EnlargedRuns, Finding, NotInAll
+from selfcal_ros.model.parts import Combined, CombinedRun, Parts
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
@@ -941,7 +942,7 @@ def _result(
         input={"file": ", ".join(member.name for member in members)},
         method=COMBINED,
         sense=first.sense,
-        extra={COMBINED: _runs(members, means)},
+        parts=Parts(combined=_runs(members, means)),
         kept=kept_covariances(_covariances(members, means)),
         verdict=_verdict(members, means),
         model=ModelResult(first.model.misalignment),
@@ -955,28 +956,31 @@ def _result(
     return replace(result, budget=_budget(result, means))
 
 
-def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[str, Any]:
+def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> Combined:
     """Return the runs with their deviations."""
-    facts: dict[str, Any] = {}
+    between: dict[str, float] = {}
     for kind, mean in means.items():
-        facts |= {
+        between |= {
             f"u_between_{KINDS[kind]}": mean.u_between,
             f"p_between{SUFFIX[kind]}": mean.p_between,
         }
-    facts["runs"] = []
+    runs = []
     for index, member in enumerate(members):
-        run = {
-            "file": member.name,
-            "run_id": member.result.run_id if member.result else "",
-            "sha256": member.result.input.get("sha256", "") if member.result else "",
-            "weight": float(means["xy"].weights[index]),
-        }
+        deviations: dict[str, Any] = {}
         for kind, mean in means.items():
-            run |= _of_run(
+            deviations |= _of_run(
                 mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(members)
             )
-        facts["runs"].append(run)
-    return facts
+        runs.append(
+            CombinedRun(
+                file=member.name,
+                run_id=member.result.run_id if member.result else "",
+                sha256=member.result.input.get("sha256", "") if member.result else "",
+                weight=float(means["xy"].weights[index]),
+                **deviations,
+            )
+        )
+    return Combined(**between, runs=tuple(runs))
 
 
 def _covariances(

@@ -64,6 +64,7 @@ from selfcal_ros.model.findings import (
     Unchecked,
 )
 from selfcal_ros.model.kept import Factors, ImagesKept, Kept, rounded
+from selfcal_ros.model.parts import Parts, ResidualsOfViews, ViewCourse, ViewResiduals
 from selfcal_ros.model.readings import (
     GridVisits,
     Measurements,
@@ -149,9 +150,6 @@ def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:
     )
 
 
-RESIDUALS = "residuals"
-"""Key among the extras of a result."""
-
 MAX_READINGS = 60_000
 """Largest number of grid readings with stored residuals: 121 x 121 marks in four views."""
 
@@ -162,13 +160,10 @@ DECIMALS_M, DECIMALS_RAD, DECIMALS_S = 13, 12, 3
 """Decimals stored: 0.1 pm, 1 prad, 1 ms."""
 
 
-def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
-    """Return the residuals of all readings for `CalibrationResult.extra`; empty for large fields.
-
-    Each view has `dx`, `dy` [i][j] (m, stage axes, mark m = i - h, n = j - h of the plate) and
-    `dtheta` [k] (rad, counter-clockwise), NaN where not read; and, if the visits of its marks
-    are known, `course`: `time_s` (from the first visit of the run), mean `dx`, `dy` (m) and
-    `count` of the readings in each interval of the view's time.
+def kept_residuals(
+    measurements: Measurements, model: ModelFit
+) -> ResidualsOfViews | None:
+    """Return the residuals of all readings; None for large fields.
 
     Parameters
     ----------
@@ -179,7 +174,7 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     """
     problem, fitted = model.problem, model.fitted
     if problem.system.grid.n_readings > MAX_READINGS:
-        return {}
+        return None
     starts = [
         int(v.visits.stamp_ns.min())
         for v in measurements.views
@@ -192,32 +187,33 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         for row, visits, residuals in model.visits_about_means()
     }
     for index, view in enumerate(measurements.views):
-        entry: dict[str, Any] = {"view": view.view.name}
+        entry = ViewResiduals(view.view.name)
         if index in problem.grid.index:
             row = problem.grid.index.index(index)
             read = problem.grid.weight[row] > 0
             residuals = (
                 np.where(read, fitted.residuals[row], np.nan) * problem.to_stage[row]
             )
-            entry |= {
-                "dx": np.round(residuals.real, DECIMALS_M),
-                "dy": np.round(residuals.imag, DECIMALS_M),
-            }
+            course = None
             if starts and view.visits is not None and len(view.visits.mark):
-                entry["course"] = _course(view.visits, at_visits[row], min(starts))
+                course = _course(view.visits, at_visits[row], min(starts))
+            entry = replace(
+                entry,
+                dx=np.round(residuals.real, DECIMALS_M),
+                dy=np.round(residuals.imag, DECIMALS_M),
+                course=course,
+            )
         if index in problem.angular.index:
             row = problem.angular.index.index(index)
             residuals = np.where(
                 problem.angular.weight[row] > 0, fitted.residuals_theta[row], np.nan
             )
-            entry["dtheta"] = np.round(residuals, DECIMALS_RAD)
+            entry = replace(entry, dtheta=np.round(residuals, DECIMALS_RAD))
         views.append(entry)
-    return {RESIDUALS: {"views": views}}
+    return ResidualsOfViews(tuple(views))
 
 
-def _course(
-    visits: GridVisits, residuals: np.ndarray, start_ns: int
-) -> dict[str, np.ndarray]:
+def _course(visits: GridVisits, residuals: np.ndarray, start_ns: int) -> ViewCourse:
     """Return the mean residual in each of `MAX_PARTS` intervals of the view's time.
 
     Or of each visit, if there are fewer.
@@ -236,12 +232,12 @@ def _course(
             ("dy", residuals.imag),
         )
     }
-    return {
-        "time_s": np.round(columns["time_s"], DECIMALS_S),
-        "dx": np.round(columns["dx"], DECIMALS_M),
-        "dy": np.round(columns["dy"], DECIMALS_M),
-        "count": count,
-    }
+    return ViewCourse(
+        time_s=np.round(columns["time_s"], DECIMALS_S),
+        dx=np.round(columns["dx"], DECIMALS_M),
+        dy=np.round(columns["dy"], DECIMALS_M),
+        count=tuple(count.tolist()),
+    )
 
 
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
@@ -568,7 +564,7 @@ def _solved(
         rejected=measurements.all_rejected(),
         findings=findings,
         sense=str(measurements.sense),
-        extra=kept_residuals(measurements, model),
+        parts=Parts(residuals=kept_residuals(measurements, model)),
         kept=replace(kept_parts, images=_kept_images(measurements, model)),
         run_id=measurements.run_id,
         model=ModelResult(

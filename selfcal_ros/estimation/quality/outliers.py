@@ -24,7 +24,6 @@ does not hold.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -69,11 +68,17 @@ from selfcal_ros.model.findings import (
     OutliersGivenUp,
     OutliersKept,
     OutliersRemoved,
-    SlipBefore,
-    SlipFound,
     SlipsGivenUp,
     TakenForSlip,
     TooManyOutliers,
+)
+from selfcal_ros.model.parts import (
+    Outliers,
+    Parts,
+    Removed,
+    Slip,
+    SlipPlace,
+    ViewNoise,
 )
 from selfcal_ros.model.readings import (
     AFTER_SLIP,
@@ -172,7 +177,7 @@ MAX_RATIO = 20.0
 
 def noisy_views(
     residuals: Residuals, measurements: Measurements
-) -> tuple[tuple[str, float], ...]:
+) -> tuple[ViewNoise, ...]:
     """Return the noisy views, each with the ratio of its noise to that of the others.
 
     By their own repeats, and by residuals.
@@ -190,7 +195,7 @@ def noisy_views(
         ratio = float(own_noise / max(noise_of_others, own_noise / MAX_RATIO, FLOOR))
         if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
             ratios[name] = max(ratio, ratios.get(name, 0.0))
-    return tuple((name, ratios[name]) for name in names if name in ratios)
+    return tuple(ViewNoise(name, ratios[name]) for name in names if name in ratios)
 
 
 AMBIGUOUS = 16.0
@@ -201,67 +206,6 @@ MAX_PLACES = 20
 
 CLIP = 4.0
 """Standard deviations to which residuals are clipped: one outlier is not a slip."""
-
-
-@dataclass(frozen=True)
-class SlipPlace:
-    """Where in a view the plate may have slipped.
-
-    Attributes
-    ----------
-    view : str
-        Name of the view.
-    index : int
-        Its position in the measurement.
-    axis : str
-        ``m`` or ``n``: index of the marks along which the view was read.
-    first : int
-        First value of that index after the slip.
-    chi2 : float
-        Explained sum of squares over the noise variance; 3 on average without a slip.
-    """
-
-    view: str
-    index: int
-    axis: str
-    first: int
-    chi2: float = 0.0
-
-    @property
-    def place(self) -> SlipBefore:
-        """View, axis and first line of marks after the slip."""
-        return SlipBefore(self.view, self.axis, self.first)
-
-
-@dataclass(frozen=True)
-class Slip(SlipPlace):
-    """A slip of the plate within a view, at a place.
-
-    Attributes
-    ----------
-    tx_m, ty_m, phi_rad : float
-        Change of offset and rotation, stage frame.
-    alternatives : tuple of SlipPlace
-        Other places that explain the readings equally well: few views do not always determine it.
-    """
-
-    tx_m: float = 0.0
-    ty_m: float = 0.0
-    phi_rad: float = 0.0
-    alternatives: tuple[SlipPlace, ...] = ()
-
-    def finding(self, *, spoils: bool) -> SlipFound:
-        """Return the slip as a finding; `spoils` if the view had to be kept unsplit."""
-        return SlipFound(
-            size=float(np.hypot(self.tx_m, self.ty_m)),
-            unit="m",
-            view=self.view,
-            places=tuple(slip.place for slip in (self, *self.alternatives)),
-            x=self.tx_m,
-            y=self.ty_m,
-            phi=self.phi_rad,
-            spoils=spoils,
-        )
 
 
 def find_slip(
@@ -452,34 +396,14 @@ NEAR_LARGEST = 0.5
 """Share of the largest ratio above which a reading is removed in the same round: an outlier
 increases the residuals of its neighbours."""
 
-LEFT = (NoisyView, TooManyOutliers, OutliersKept, OutliersGivenUp, SlipsGivenUp)
+LEFT = (
+    NoisyView,
+    TooManyOutliers,
+    OutliersKept,
+    OutliersGivenUp,
+    SlipsGivenUp,
+)
 """Findings of faults that could not be corrected."""
-
-
-@dataclass(frozen=True)
-class Removed:
-    """A reading that was removed.
-
-    Attributes
-    ----------
-    view, kind : str
-        Name of the view; ``grid`` or ``angular``.
-    mark : tuple of int
-        (m, n), or (k,).
-    standardised : float
-        Residual over its standard deviation when it was removed.
-    leverage : float
-        Part of the reading that the fit followed.
-    residual : float
-        Length of the residual, m, or its size, rad.
-    """
-
-    view: str
-    kind: str
-    mark: tuple[int, ...]
-    standardised: float
-    leverage: float
-    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,9 +413,22 @@ class OutlierScreening:
     measurements: Measurements
     removed: tuple[Removed, ...]
     slips: tuple[Slip, ...]
-    noisy: tuple[tuple[str, float], ...]
+    noisy: tuple[ViewNoise, ...]
     unchecked: int
     findings: tuple[Finding, ...]
+
+    def with_tables(self, parts: Parts) -> Parts:
+        """Return parts of a result with the tables of outliers, slips and noisy views."""
+        rule = (
+            "removed if its squared standardised residual fails an F-test at level "
+            f"{OUTLIER_LEVEL}/n, for marks and lines together"
+        )
+        return replace(
+            parts,
+            outliers=Outliers(rule, self.unchecked, self.removed),
+            slips=self.slips,
+            noisy_views=self.noisy,
+        )
 
 
 @one_thread()
@@ -693,7 +630,11 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
                 mark=mark,
                 standardised=float(np.sqrt(ratio[at])),
                 leverage=float(1 - readings.redundancy[at]),
-                residual=float(abs(readings.residual[at])),
+                **{
+                    "residual_m" if grid else "residual_rad": float(
+                        abs(readings.residual[at])
+                    )
+                },
             )
     return outliers
 
@@ -748,7 +689,7 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
 
 def _findings(
     removed: tuple[Removed, ...],
-    noisy: tuple[tuple[str, float], ...],
+    noisy: tuple[ViewNoise, ...],
     stopped: Finding | None,
 ) -> list[Finding]:
     findings: list[Finding] = []
@@ -758,7 +699,10 @@ def _findings(
             for item in removed[:FEW_OUTLIERS]
         )
         findings.append(OutliersRemoved(number=len(removed), first=first))
-    findings += [NoisyView(size=ratio, unit="m/m", view=name) for name, ratio in noisy]
+    findings += [
+        NoisyView(size=noisy_view.ratio, unit="m/m", view=noisy_view.view)
+        for noisy_view in noisy
+    ]
     return findings if stopped is None else [*findings, stopped]
 
 
@@ -778,32 +722,3 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
         linear = flat[marks_read] * problem.grid.poses[row].phase
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))
-
-
-def listed(cleaned: OutlierScreening) -> dict[str, Any]:
-    """Return the tables of outliers, slips and noisy views for RESULT.json, SI units."""
-    removed = [
-        {
-            "view": item.view,
-            "kind": item.kind,
-            "mark": list(item.mark),
-            "standardised": item.standardised,
-            "leverage": item.leverage,
-            "residual_m": item.residual if item.kind == "grid" else None,
-            "residual_rad": item.residual if item.kind == "angular" else None,
-        }
-        for item in cleaned.removed
-    ]
-    outliers = {
-        "rule": f"removed if its squared standardised residual fails an F-test at level "
-        f"{OUTLIER_LEVEL}/n, for marks and lines together",
-        "unchecked": cleaned.unchecked,
-        "removed": removed,
-    }
-    return {
-        "outliers": outliers,
-        "slips": [asdict(item) for item in cleaned.slips],
-        "noisy_views": [
-            {"view": name, "ratio": ratio} for name, ratio in cleaned.noisy
-        ],
-    }

@@ -156,53 +156,26 @@ Place = tuple[str, str, float, float]
 
 
 def rejected_in(result: CalibrationResult) -> list[Place]:
-    """Return rejected detections of known position, and marks that `--robust` removed.
-
-    Malformed entries are left out.
-    """
-    places: list[Place] = []
-    for row in _rows(result.extra.get("rejected_at")):
-        columns = [row.get(key) for key in ("reason", "x", "y")]
-        if not all(isinstance(column, list | tuple | np.ndarray) for column in columns):
-            continue
-        places += [
-            (str(row.get("view")), str(reason), x * MM_PER_M, y * MM_PER_M)
-            for reason, x, y in zip(*columns, strict=False)
-            if _number(x) and _number(y)
-        ]
+    """Return rejected detections of known position, and marks that `--robust` removed."""
+    places = [
+        (rejected.view, reason, float(x * MM_PER_M), float(y * MM_PER_M))
+        for rejected in result.parts.rejected_at or ()
+        for reason, x, y in zip(rejected.reason, rejected.x, rejected.y, strict=False)
+        if np.isfinite(x) and np.isfinite(y)
+    ]
     views = {view.name: view for view in result.views}
-    outliers = result.extra.get("outliers")
-    removed = outliers.get("removed") if isinstance(outliers, dict) else None
-    for row in _rows(removed):
-        view = views.get(str(row.get("view")))
-        if view is not None and row.get("kind") == "grid":
-            places += _marked(result, view, row.get("mark"))
+    outliers = result.parts.outliers
+    for removed in outliers.removed if outliers else ():
+        view = views.get(removed.view)
+        if view is not None and removed.kind == "grid":
+            places.append(_of_outlier(result.plate, view, removed.mark))
     return places
 
 
-def _rows(value: object) -> list[dict]:
-    return (
-        [row for row in value if isinstance(row, dict)]
-        if isinstance(value, list)
-        else []
-    )
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
-
-
-def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[Place]:
-    if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
-        return []
-    m, n = (np.array(component) for component in mark)
-    if result.plate.marks and not result.plate.has(m, n):
-        return []
-    at = (
-        component * result.plate.grid_pitch_m for component in result.plate.places(m, n)
-    )
+def _of_outlier(plate: Artifact, view: ViewResult, mark: tuple[int, ...]) -> Place:
+    at = np.array(plate.places(*np.array(mark))) * plate.grid_pitch_m
     x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), *at)
-    return [(view.name, "outlier_among_views", float(x), float(y))]
+    return (view.name, "outlier_among_views", float(x), float(y))
 
 
 def rejected_map(result: CalibrationResult) -> Drawing | None:

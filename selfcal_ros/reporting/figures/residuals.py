@@ -19,7 +19,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 
 @dataclass(frozen=True, eq=False)
-class ViewResiduals:
+class DrawnResiduals:
     """Residuals of one view.
 
     Attributes
@@ -62,51 +62,38 @@ def places_mm(
     )
 
 
-def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
-    """Return the residuals in a result by view; empty if there are none.
-
-    A malformed part counts as absent.
-    """
-    stored = result.extra.get("residuals")
-    rows = stored.get("views") if isinstance(stored, dict) else None
-    if not isinstance(rows, list) or len(rows) != len(result.views):
-        return []
+def residuals_in(result: CalibrationResult) -> list[DrawnResiduals]:
+    """Return the residuals in a result by view; empty if there are none."""
+    stored = result.parts.residuals
     shape = result.plate.shape
     lines = (result.plate.angular_count,)
-    residuals = []
-    for view, row in zip(result.views, rows, strict=True):
-        entry = row if isinstance(row, dict) else {}
-        residuals.append(
-            ViewResiduals(
-                view,
-                np.stack([_array(entry.get(k), shape) for k in ("dx", "dy")]),
-                _course(entry.get("course")),
-                _array(entry.get("dtheta"), lines),
-            )
+    if stored is None or len(stored.views) != len(result.views):
+        return []
+    return [
+        DrawnResiduals(
+            view,
+            np.stack([_of_shape(values, shape) for values in (row.dx, row.dy)]),
+            np.zeros((4, 0))
+            if row.course is None
+            else np.array(
+                [row.course.time_s, row.course.dx, row.course.dy, row.course.count]
+            ),
+            _of_shape(row.dtheta, lines),
         )
-    return residuals
+        for view, row in zip(result.views, stored.views, strict=True)
+    ]
 
 
-def _course(value: object) -> np.ndarray:
-    entry = value if isinstance(value, dict) else {}
-    columns = [entry.get(key) for key in ("time_s", "dx", "dy", "count")]
-    try:
-        array = np.array(columns, dtype=float)
-    except (TypeError, ValueError):
-        return np.zeros((4, 0))
-    return array if array.ndim == 2 and np.isfinite(array).all() else np.zeros((4, 0))
-
-
-def _array(value: object, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        return np.full(shape, np.nan)
-    return array if array.shape == shape else np.full(shape, np.nan)
+def _of_shape(values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    return (
+        values
+        if values is not None and values.shape == shape
+        else np.full(shape, np.nan)
+    )
 
 
 def residual_maps(
-    result: CalibrationResult, residuals: Sequence[ViewResiduals]
+    result: CalibrationResult, residuals: Sequence[DrawnResiduals]
 ) -> Drawing | None:
     """Return the grid residuals of every view as vectors at the marks; None if there are none."""
     views = [v for v in residuals if np.isfinite(v.xy_m).any()]
@@ -143,12 +130,12 @@ MOST_DOTS = 400
 """Dots of a normal plot; of more, evenly spaced ones are shown."""
 
 
-def distributions(residuals: Sequence[ViewResiduals], kind: str) -> Drawing | None:
+def distributions(residuals: Sequence[DrawnResiduals], kind: str) -> Drawing | None:
     """Return a histogram and a normal plot of every view.
 
     Parameters
     ----------
-    residuals : sequence of ViewResiduals
+    residuals : sequence of DrawnResiduals
         The residuals.
     kind : str
         ``xy`` (both coordinates, µm) or ``theta`` (arcsec).
@@ -266,7 +253,7 @@ def _some(count: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, MOST_DOTS).round().astype(int)).tolist()
 
 
-def courses(residuals: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
+def courses(residuals: Sequence[DrawnResiduals], sigma_m: float) -> Drawing | None:
     """Return the mean grid residuals over the time of each view; None if times are unknown.
 
     The band contains 95 % of the means of random noise `sigma_m` (m, one reading).

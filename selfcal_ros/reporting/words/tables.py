@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables and lines for people: a validation, an uncertainty budget, next steps of a plan."""
 
-from typing import Any
-
 import numpy as np
 
 from selfcal_ros.estimation.observability import plan_check
@@ -13,6 +11,7 @@ from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.budget import BudgetLine
 from selfcal_ros.model.findings import Finding, RestNotIdentified
+from selfcal_ros.model.parts import HeldOutFigures
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.view import Plan
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
@@ -32,26 +31,26 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
-def validation_json(
+def held_out_figures(
     held_out: list[HeldOut], artifact: Artifact
-) -> list[dict[str, Any]]:
-    """Return the validation for ``extra["validation"]`` of a result: SI units."""
-    return [
-        {
-            "name": held_out_text(item.view, item.tenth),
-            "view": item.view,
-            "n_grid": item.n_grid,
-            "n_angular": item.n_angular,
-            "rms_m": item.rms_m,
-            "max_m": item.max_m,
-            "rms_rad": item.rms_rad,
-            "ratio": item.ratio,
-            "note": why_text(item.why, artifact),
-            "limit": item.limit,
-            "exceeds": item.exceeds,
-        }
+) -> tuple[HeldOutFigures, ...]:
+    """Return the validation as a part of a result."""
+    return tuple(
+        HeldOutFigures(
+            name=held_out_text(item.view, item.tenth),
+            view=item.view,
+            n_grid=item.n_grid,
+            n_angular=item.n_angular,
+            rms_m=item.rms_m,
+            max_m=item.max_m,
+            rms_rad=item.rms_rad,
+            ratio=item.ratio,
+            note=why_text(item.why, artifact),
+            limit=item.limit,
+            exceeds=bool(item.exceeds),
+        )
         for item in held_out
-    ]
+    )
 
 
 def validation_text(held_out: list[HeldOut], artifact: Artifact) -> list[str]:

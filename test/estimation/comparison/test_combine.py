@@ -336,7 +336,7 @@ def test_lengths_of_different_certificates_explain_that_magnifications_differ():
     found = combine(runs, keep_scale=True)
     assert not found.xy.common.any()
     assert found.result.verdict.grade is Grade.GOOD
-    assert all(run["agrees"] for run in found.result.extra["combined"]["runs"])
+    assert all(run.agrees for run in found.result.parts.combined.runs)
 
 
 def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
@@ -421,9 +421,9 @@ def test_the_run_that_differs_is_named():
         runs[2], error_map=replace(emap, gx=emap.gx + off[0], gy=emap.gy + off[1])
     )
     found = combine([part(str(i), run) for i, run in enumerate(runs)]).result
-    rows = found.extra["combined"]["runs"]
-    assert [row["stands_out"] for row in rows] == [False, False, True, False]
-    assert not rows[2]["agrees"] and rows[2]["e_n_rms"] > 2 * rows[0]["e_n_rms"]
+    rows = found.parts.combined.runs
+    assert [row.stands_out for row in rows] == [False, False, True, False]
+    assert not rows[2].agrees and rows[2].e_n_rms > 2 * rows[0].e_n_rms
     assert found.verdict.grade is Grade.ENLARGED
     assert found.verdict.enlarged_by[0].name == "between_runs"
     assert (
@@ -440,8 +440,8 @@ def test_the_run_that_differs_is_named():
 def test_runs_agree_where_p_is_above_the_level():
     rows = combine(
         [part(name, one) for name, one in zip("abc", (A, B, C), strict=True)]
-    ).result.extra["combined"]["runs"]
-    assert all(row["agrees"] and 0.05 < row["p"] <= 1 for row in rows)
+    ).result.parts.combined.runs
+    assert all(row.agrees and 0.05 < row.p <= 1 for row in rows)
 
 
 def test_sites_that_a_run_does_not_know_are_unknown():

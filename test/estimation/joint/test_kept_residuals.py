@@ -44,10 +44,10 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
     for view, found, kept in zip(
         measurements.views,
         result.views,
-        result.extra["residuals"]["views"],
+        result.parts.residuals.views,
         strict=True,
     ):
-        assert kept["view"] == view.view.name
+        assert kept.view == view.view.name
         pose = view.view.lattice_pose(artifact)
         turns = pose.turn_lines
         for k, value in zip(view.k, view.dtheta, strict=True):
@@ -56,9 +56,9 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
                 -emap.g_theta[-at] if sense is Sense.PLATE_MOVES else emap.g_theta[at]
             )
             expected = value - (stage + amap.a_theta[k] + found.phi)
-            assert kept["dtheta"][k] == pytest.approx(expected, abs=2e-12)
+            assert kept.dtheta[k] == pytest.approx(expected, abs=2e-12)
         if not len(view.m):
-            assert "dx" not in kept
+            assert kept.dx is None
             continue
         for m, n, dx, dy in zip(view.m, view.n, view.dx, view.dy, strict=True):
             turn = 1j**pose.quarter_turns
@@ -72,10 +72,10 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
             expected = complex(dx, dy) - (
                 stage + plate + 1j * found.phi * arm + complex(found.tx, found.ty)
             )
-            assert kept["dx"][m + h, n + h] == pytest.approx(expected.real, abs=2e-13)
-            assert kept["dy"][m + h, n + h] == pytest.approx(expected.imag, abs=2e-13)
+            assert kept.dx[m + h, n + h] == pytest.approx(expected.real, abs=2e-13)
+            assert kept.dy[m + h, n + h] == pytest.approx(expected.imag, abs=2e-13)
             seen += 1
-        assert np.isfinite(kept["dx"]).sum() == len(view.m)
+        assert np.isfinite(kept.dx).sum() == len(view.m)
     assert seen > 100
 
 
@@ -92,33 +92,33 @@ def test_a_course_follows_the_readings_of_each_visit():
     views[0] = replace(views[0], dx=means, visits=jumped)
     kept = calibrate(
         replace(measurements, views=tuple(views)), bare(causes=False)
-    ).extra["residuals"]["views"]
-    course = kept[0]["course"]
-    early = course["time_s"] < np.median(course["time_s"])
-    assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(
+    ).parts.residuals.views
+    course = kept[0].course
+    early = course.time_s < np.median(course.time_s)
+    assert course.dx[~early].mean() - course.dx[early].mean() == pytest.approx(
         5e-7, rel=0.1
     )
-    assert abs(course["dy"][~early].mean() - course["dy"][early].mean()) < 2e-8
-    assert course["count"].sum() == visits.count.sum()
+    assert abs(course.dy[~early].mean() - course.dy[early].mean()) < 2e-8
+    assert sum(course.count) == visits.count.sum()
 
 
 def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
     measurements = measured(visits=True)
-    kept = calibrate(measurements, BARE).extra["residuals"]["views"]
+    kept = calibrate(measurements, BARE).parts.residuals.views
     for view, entry in zip(measurements.views, kept, strict=True):
         if not len(view.m):
-            assert "course" not in entry
+            assert entry.course is None
             continue
-        course, count = entry["course"], view.visits.count
+        course, count = entry.course, view.visits.count
         first = min(v.visits.stamp_ns.min() for v in measurements.views if len(v.m))
-        assert np.average(course["dx"], weights=course["count"]) == pytest.approx(
-            np.average(entry["dx"][np.isfinite(entry["dx"])]), abs=1e-12
+        assert np.average(course.dx, weights=course.count) == pytest.approx(
+            np.average(entry.dx[np.isfinite(entry.dx)]), abs=1e-12
         )
         mean_s = np.average((view.visits.stamp_ns - first) / 1e9, weights=count)
-        assert np.average(course["time_s"], weights=course["count"]) == pytest.approx(
+        assert np.average(course.time_s, weights=course.count) == pytest.approx(
             mean_s, abs=1e-3
         )
-        assert (np.diff(course["time_s"]) > 0).all()
+        assert (np.diff(course.time_s) > 0).all()
 
 
 @pytest.mark.parametrize("parts", [1, 8, 60, 200])
@@ -147,29 +147,29 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(
     views += measurements.views[2:]
     kept = calibrate(
         replace(measurements, views=tuple(views)), bare(causes=False)
-    ).extra["residuals"]["views"]
+    ).parts.residuals.views
     first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
     for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
-        visits, course = view.visits, entry["course"]
+        visits, course = view.visits, entry.course
         at = view.m[visits.mark] + 3, view.n[visits.mark] + 3
         found = {
             "time_s": (visits.stamp_ns - first) / 1e9,
-            "dx": entry["dx"][at] + dx,
-            "dy": entry["dy"][at] + dy,
+            "dx": entry.dx[at] + dx,
+            "dy": entry.dy[at] + dy,
         }
         chosen = [
             part
             for part in np.array_split(np.argsort(visits.stamp_ns), parts)
             if len(part)
         ]
-        assert len(chosen) == len(course["count"])
+        assert len(chosen) == len(course.count)
         for number, part in enumerate(chosen):
-            assert course["count"][number] == visits.count[part].sum()
+            assert course.count[number] == visits.count[part].sum()
             for name, values in found.items():
                 mean = (values[part] * visits.count[part]).sum() / visits.count[
                     part
                 ].sum()
-                assert course[name][number] == pytest.approx(
+                assert getattr(course, name)[number] == pytest.approx(
                     mean, abs=1e-3 if name == "time_s" else 2e-13
                 )
 
@@ -178,13 +178,11 @@ def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monke
     measurements = measured()
     result = calibrate(measurements, BARE)
     data = result_to_dict(worded(result))
-    again = result_from_dict(data, "r.json").extra["residuals"]["views"]
-    own = result.extra["residuals"]["views"]
-    assert [e["view"] for e in again] == [e["view"] for e in own]
-    assert again[3]["dx"] == [
-        [None if np.isnan(v) else v for v in row] for row in own[3]["dx"].tolist()
-    ]
+    again = result_from_dict(data, "r.json").parts.residuals.views
+    own = result.parts.residuals.views
+    assert [e.view for e in again] == [e.view for e in own]
+    np.testing.assert_array_equal(again[3].dx, own[3].dx)
     monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42 - 1)
-    assert "residuals" not in calibrate(measurements, BARE).extra
+    assert calibrate(measurements, BARE).parts.residuals is None
     monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42)
-    assert "residuals" in calibrate(measurements, BARE).extra
+    assert calibrate(measurements, BARE).parts.residuals is not None

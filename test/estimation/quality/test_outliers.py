@@ -111,8 +111,8 @@ def refused(result, reason):
 
 def removed(result):
     return {
-        (row["view"], row["kind"], ", ".join(map(str, row["mark"])))
-        for row in result.extra["outliers"]["removed"]
+        (row.view, row.kind, ", ".join(map(str, row.mark)))
+        for row in result.parts.outliers.removed
     }
 
 
@@ -281,7 +281,7 @@ def test_a_turned_microscope_is_no_slip():
         ),
     )
     result = robust_calibrate(turned, LINEAR)
-    assert result.extra["slips"] == []
+    assert result.parts.slips == ()
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
     assert result.verdict.grade is not Grade.GOOD
     assert result.verdict.causes[0].name == "microscope"
@@ -299,7 +299,7 @@ def test_a_turned_microscope_is_no_slip():
     )
     mended = robust_calibrate(bad, with_term)
     assert removed(mended) == {("90", "grid", "-4, 2")}
-    assert mended.extra["slips"] == [] and mended.verdict.qualified
+    assert mended.parts.slips == () and mended.verdict.qualified
 
 
 def test_the_visits_of_a_split_view_stay_with_their_marks():
@@ -341,7 +341,7 @@ def test_giving_up_is_said(monkeypatch):
     assert "gave up on slips after 0: the readings seem to contain more" in " ".join(
         worded(result).warnings
     )
-    assert result.extra["slips"] == []
+    assert result.parts.slips == ()
     refused(result, "gave up on slips after 0")
 
 
@@ -355,8 +355,8 @@ def test_a_view_is_compared_by_its_own_repeats():
         ),
     )
     assert noisy_views(residuals_of(readings, ZERO_MEAN), readings) == ()
-    (named,) = robust_calibrate(shaken, ZERO_MEAN).extra["noisy_views"]
-    assert named["view"] == "rot90" and named["ratio"] == pytest.approx(2.0)
+    (named,) = robust_calibrate(shaken, ZERO_MEAN).parts.noisy_views
+    assert named.view == "rot90" and named.ratio == pytest.approx(2.0)
 
 
 def test_a_reading_goes_where_it_adds_more_than_one_in_a_hundred_sets_of_good_ones():
@@ -403,10 +403,10 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
     assert (
         result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
     )
-    row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == [-4, 2])
-    assert row["standardised"] > 10 and 0 < row["leverage"] < 1
+    row = next(r for r in result.parts.outliers.removed if r.mark == (-4, 2))
+    assert row.standardised > 10 and 0 < row.leverage < 1
     # the fit follows the outlier by its leverage: the residual is the rest of it
-    assert row["residual_m"] == pytest.approx((1 - row["leverage"]) * 1e-6, abs=1e-7)
+    assert row.residual_m == pytest.approx((1 - row.leverage) * 1e-6, abs=1e-7)
     assert "removed 4 outliers: 'identity' angular 5" in worded(result).warnings[-1]
 
 
@@ -422,7 +422,7 @@ def test_removed_readings_survive_the_file(tmp_path):
     _, readings = measured(3)
     result = robust_calibrate(with_errors(readings, 1, dx={(0, 0): 1e-6}), ZERO_MEAN)
     again = result_from_dict(plain(result_to_dict(worded(result))), "r")
-    assert again.extra["outliers"] == plain(result.extra["outliers"])
+    assert plain(again.parts.outliers) == plain(result.parts.outliers)
 
 
 @pytest.mark.parametrize(
@@ -438,12 +438,12 @@ def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     slipped_readings = slipped(readings, index, axis, first, change)
     view = readings.views[index]
     result = robust_calibrate(slipped_readings, ZERO_MEAN)
-    (slip,) = result.extra["slips"]
-    assert (slip["view"], slip["axis"], slip["first"]) == (view.view.name, axis, first)
-    assert slip["alternatives"] == ()
-    assert slip["tx_m"] == pytest.approx(change[0], abs=3e-8)
-    assert slip["ty_m"] == pytest.approx(change[1], abs=3e-8)
-    assert slip["phi_rad"] == pytest.approx(change[2], abs=1e-6)
+    (slip,) = result.parts.slips
+    assert (slip.view, slip.axis, slip.first) == (view.view.name, axis, first)
+    assert slip.alternatives == ()
+    assert slip.tx_m == pytest.approx(change[0], abs=3e-8)
+    assert slip.ty_m == pytest.approx(change[1], abs=3e-8)
+    assert slip.phi_rad == pytest.approx(change[2], abs=1e-6)
     assert not removed(result)
     assert error_rms(result, truth) < 1.3 * error_rms(solved(readings), truth)
     name = view.view.name
@@ -461,11 +461,9 @@ def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
     result = robust_calibrate(
         slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN
     )
-    (slip,) = result.extra["slips"]
-    assert slip["view"] == "shift_x"
-    places = [
-        (place["axis"], place["first"]) for place in (slip, *slip["alternatives"])
-    ]
+    (slip,) = result.parts.slips
+    assert slip.view == "shift_x"
+    places = [(place.axis, place.first) for place in (slip, *slip.alternatives)]
     assert ("m", 2) in places and len(set(places)) >= 2
     assert (
         "do not determine which; this spoils the map: measure the view again"
@@ -493,7 +491,7 @@ def slipped(readings, index, axis, first, change):
 def test_one_gross_outlier_is_no_slip():
     _, readings = measured(9)
     result = robust_calibrate(with_errors(readings, 3, dx={(1, 1): 5e-6}), ZERO_MEAN)
-    assert result.extra["slips"] == []
+    assert result.parts.slips == ()
     assert removed(result) == {("shift_x", "grid", "1, 1")}
 
 
@@ -509,8 +507,8 @@ def test_a_noisy_view_is_named(index):
     )
     views = (*readings.views[:index], noisy, *readings.views[index + 1 :])
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
-    (named,) = result.extra["noisy_views"]
-    assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
+    (named,) = result.parts.noisy_views
+    assert named.view == view.view.name and 3 < named.ratio <= 20
     assert (
         "times as noisy as the others: measure it again" in worded(result).warnings[-1]
     )
@@ -535,9 +533,9 @@ def test_exact_readings_have_no_outliers():
     _, readings = measured(8, sigma=0.0)
     views = tuple(replace(v, dtheta=v.dtheta) for v in readings.views)
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
-    assert {kind for _, kind, _ in removed(result)} <= {"angular"} and not result.extra[
-        "slips"
-    ]
+    assert {kind for _, kind, _ in removed(result)} <= {
+        "angular"
+    } and not result.parts.slips
 
 
 def test_order_of_readings_does_not_matter():
@@ -565,7 +563,7 @@ def test_order_of_readings_does_not_matter():
         for r in (bad, replace(bad, views=tuple(shuffled)))
     )
     assert np.array_equal(a.error_map.gx, b.error_map.gx)
-    assert a.extra["outliers"] == b.extra["outliers"]
+    assert plain(a.parts.outliers) == plain(b.parts.outliers)
 
 
 def test_finite_rotations_are_no_outliers_with_the_rigid_model():

@@ -18,7 +18,7 @@ from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import held_out_text, worded
 from selfcal_ros.reporting.words.tables import (
-    validation_json,
+    held_out_figures,
     validation_text,
     why_text,
 )
@@ -149,7 +149,7 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
     found = validate(readings, BARE, folds=1)
     line = "cannot be held out: the rest does not converge"
     assert validation_text(found, ARTIFACT)[1] == f"view 'identity': {line}"
-    assert validation_json(found, ARTIFACT)[1]["note"] == line and not found[1].exceeds
+    assert held_out_figures(found, ARTIFACT)[1].note == line and not found[1].exceeds
     assert [called(item) for item in found if item.n_grid] == [
         "a random tenth (1)",
         "view 'rot90'",
@@ -221,7 +221,7 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
         f"{bad.limit:.2f}",
     )
     assert judged.verdict.sentence == f"Not qualified: {judged.verdict.reasons[0]}"
-    assert validation_json([bad], ARTIFACT)[0]["exceeds"] is True
+    assert held_out_figures([bad], ARTIFACT)[0].exceeds is True
 
 
 def test_terms_are_predicted_with_the_readings(few_draws):
@@ -316,5 +316,5 @@ def test_text_and_json(few_draws):
     found = validate(measured(), bare(datum_theta="zero_mean"), folds=1)
     text = validation_text(found, ARTIFACT)
     assert "marks predicted within" in text[0] and "arcsec rms" in text[0]
-    assert len(validation_json(found, ARTIFACT)) == len(text) == 6
-    assert validation_json(found, ARTIFACT)[0]["rms_m"] == found[0].rms_m
+    assert len(held_out_figures(found, ARTIFACT)) == len(text) == 6
+    assert held_out_figures(found, ARTIFACT)[0].rms_m == found[0].rms_m

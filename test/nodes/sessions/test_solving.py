@@ -170,12 +170,11 @@ def test_the_robust_solver_leaves_out_a_reading_that_contradicts_the_others():
         views[1].dx[3] += 5e-6
         desk.take(views)
     assert [
-        (item["view"], item["kind"])
-        for item in robust.session.result.extra["outliers"]["removed"]
+        (item.view, item.kind) for item in robust.session.result.parts.outliers.removed
     ] == [(PLAN.views[1].name, "grid")]
     assert robust.session.result.verdict.qualified
     assert not plain.session.result.verdict.qualified
-    assert "outliers" not in plain.session.result.extra
+    assert plain.session.result.parts.outliers is None
 
 
 def test_pictures_come_after_what_they_show(desk):

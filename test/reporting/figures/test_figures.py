@@ -9,6 +9,13 @@ import numpy as np
 import pytest
 
 from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.parts import (
+    Parts,
+    RejectedAt,
+    ResidualsOfViews,
+    ViewCourse,
+    ViewResiduals,
+)
 from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.figures.drawing import (
@@ -58,10 +65,10 @@ def long_names(result):
         replace(v, name=f"{v.name} of the third repetition on Monday morning")
         for v in result.views
     )
-    rows = [
-        {**row, "view": view.name}
-        for row, view in zip(result.extra["residuals"]["views"], views, strict=True)
-    ]
+    rows = tuple(
+        replace(row, view=view.name)
+        for row, view in zip(result.parts.residuals.views, views, strict=True)
+    )
     estimates = tuple(
         TermEstimate(v.name, f"{axis} P{n}", 1e-7 / n, 1e-9, "m")
         for v in views
@@ -72,7 +79,7 @@ def long_names(result):
         result,
         views=views,
         model=ModelResult("rigid", (TermResult("drift", None, estimates),)),
-        extra={**result.extra, "residuals": {"views": rows}},
+        parts=replace(result.parts, residuals=ResidualsOfViews(rows)),
     )
 
 
@@ -144,9 +151,9 @@ def test_residuals_of_a_turned_view_stand_where_its_marks_lie():
     result = with_residuals(3, 0)
     only = np.full((3, 3), np.nan)
     only[2, 1] = 1e-8
-    rows = [{"view": v.name} for v in result.views]
-    rows[1] |= {"dx": only, "dy": np.where(np.isnan(only), np.nan, 0.0)}
-    turned = replace(result, extra={"residuals": {"views": rows}})
+    rows = [ViewResiduals(v.name) for v in result.views]
+    rows[1] = replace(rows[1], dx=only, dy=np.where(np.isnan(only), np.nan, 0.0))
+    turned = replace(result, parts=Parts(ResidualsOfViews(tuple(rows))))
     assert math.degrees(turned.views[1].rotation) == pytest.approx(90)
     drawing = residual_maps(turned, residuals_in(turned))
     box = next(
@@ -383,16 +390,15 @@ def test_a_drift_is_drawn_from_its_legendre_coefficients():
 
 def test_courses_need_times_and_show_a_rise_upwards():
     result = with_residuals()
-    rows = [dict(row) for row in result.extra["residuals"]["views"]]
-    rows[0]["course"] = {
-        "time_s": np.arange(5.0),
-        "dx": np.arange(5) * 1e-8,
-        "dy": np.zeros(5),
-        "count": np.ones(5),
-    }
-    for row in rows[1:]:
-        del row["course"]
-    found = residuals_in(replace(result, extra={"residuals": {"views": rows}}))
+    course = ViewCourse(
+        np.arange(5.0), dx=np.arange(5) * 1e-8, dy=np.zeros(5), count=(1,) * 5
+    )
+    first, *others = result.parts.residuals.views
+    rows = [
+        replace(first, course=course),
+        *(replace(row, course=None) for row in others),
+    ]
+    found = residuals_in(replace(result, parts=Parts(ResidualsOfViews(tuple(rows)))))
     drawing = courses(found, 1e-8)
     rise = next(
         i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0"
@@ -553,15 +559,9 @@ def test_rejected_readings_stand_where_they_happened():
 
 def test_readings_rejected_far_away_stand_at_the_edge_of_their_panel():
     result = with_residuals(9, 8, size_y=5)
-    far = [
-        {
-            "view": result.views[0].name,
-            "reason": ["low_score"] * 2,
-            "x": [1.0, -1.0],
-            "y": [1.0, -1.0],
-        }
-    ]
-    drawing = rejected_map(replace(result, extra={"rejected_at": far}))
+    edge = np.array([1.0, -1.0])
+    far = RejectedAt(result.views[0].name, ("low_score",) * 2, edge, edge)
+    drawing = rejected_map(replace(result, parts=Parts(rejected_at=(far,))))
     (left, top), _, (right, bottom), *_ = next(
         item.lines[0]
         for item in drawing.items
@@ -571,28 +571,10 @@ def test_readings_rejected_far_away_stand_at_the_edge_of_their_panel():
     assert np.ravel(dots.centres) == pytest.approx([right, top, left, bottom])
 
 
-@pytest.mark.parametrize(
-    "extra",
-    [
-        {},
-        {"residuals": 5},
-        {"residuals": {"views": []}},
-        {"residuals": {"views": "abc"}},
-        {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
-        {
-            "residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4},
-            "rejected_at": [{}],
-        },
-        {"rejected_at": [{"view": "identity", "reason": "abc", "x": [1], "y": ["b"]}]},
-        {
-            "outliers": {
-                "removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]
-            }
-        },
-    ],
-)
-def test_extras_of_another_form_are_left_out(extra):
-    result = replace(known_result(3, 0)[0], extra=extra)
+@pytest.mark.parametrize("views", [(), ("a",), ("a",) * 4])
+def test_residuals_of_other_views_or_of_none_are_left_out(views):
+    rows = tuple(ViewResiduals(name, dx=np.zeros((1, 1))) for name in views)
+    result = replace(known_result(3, 0)[0], parts=Parts(ResidualsOfViews(rows)))
     found = residuals_in(result)
     assert residual_maps(result, found) is None and courses(found, 1e-8) is None
     assert distributions(found, "xy") is None and rejected_map(result) is None
