@@ -66,9 +66,33 @@ class Pattern:
     lines: np.ndarray | None = None
 
 
-Located = Iterator[tuple[dict[str, Any], np.ndarray]]
-"""Combinations of the coefficients, the most significant of which sizes a finding: further fields
-of the finding, and the weights of the coefficients."""
+@dataclass(frozen=True)
+class Where:
+    """What a combination of coefficients is, in the finding that it sizes.
+
+    Attributes
+    ----------
+    view, against : str
+        Its view, and the one from which it differs; empty if there is none.
+    axis, part : str
+        ``x`` or ``y``, and its component; empty where that says nothing.
+    unit : str
+        Its SI unit; empty for that of the block.
+    least_u : float
+        Standard uncertainty that it has at least, in that unit.
+    """
+
+    view: str = ""
+    against: str = ""
+    axis: str = ""
+    part: str = ""
+    unit: str = ""
+    least_u: float = 0.0
+
+
+Located = Iterator[tuple[Where, np.ndarray]]
+"""Combinations of the coefficients, the most significant of which sizes a finding: what each is,
+and the weights of the coefficients."""
 
 
 class Coefficient(Protocol):
@@ -117,13 +141,8 @@ def by_coefficient(estimates: Estimates, names: tuple[str, ...]) -> Located:
     for column, weights in zip(
         estimates.columns, np.eye(len(estimates.columns)), strict=True
     ):
-        yield (
-            {
-                "view": names[column.view] if column.view != SHARED else "",
-                "details": {"part": column.component},
-            },
-            weights,
-        )
+        view = names[column.view] if column.view != SHARED else ""
+        yield Where(view=view, part=column.component), weights
 
 
 def differences(

@@ -55,6 +55,55 @@ class Found:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CauseDetails:
+    """Further data of the sentence of a cause, SI units; what a cause does not have is left out.
+
+    Attributes
+    ----------
+    part, against : str
+        Component of its block, and the view from which its view differs.
+    either : bool
+        Whether the scale of the other offsets explains it as well.
+    given : float
+        Size with which the term was assumed, where readings show a larger one.
+    declared : float
+        0 of a term that was declared to be so.
+    x, y, phi : float
+        Slip of the plate, stage frame, m and rad.
+    after : float
+        Part of the visits of the view before it.
+    away : float
+        Distance of the stage from the sites, m.
+    harmonics : int
+        Harmonics of the angular map that do not suffice.
+    nodes : tuple of int
+        Nodes of the map along x and y that do not.
+    """
+
+    part: str = ""
+    against: str = ""
+    either: bool = False
+    given: float = math.nan
+    declared: float = math.nan
+    x: float = math.nan
+    y: float = math.nan
+    phi: float = math.nan
+    after: float = math.nan
+    away: float = math.nan
+    harmonics: int = 0
+    nodes: tuple[int, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what there is, by name."""
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not (isinstance(value, float) and math.isnan(value))
+            and (isinstance(value, float) or value)
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
 class Cause(Found):
     """Explanation of the residuals, or of an enlarged uncertainty.
 
@@ -62,8 +111,8 @@ class Cause(Found):
     ----------
     name : str
         Name of a term, or ``slip``, ``reading``, ``off_sites``, ``roughness`` or ``noise``.
-    details : dict
-        Further data of its sentence, by name: those of its block.
+    details : CauseDetails
+        Further data of its sentence.
     effect_rms, effect_max : float
         Effect on the map: of one coordinate, m, or of the angular map, rad, if `unit` is
         rad and it is in the lines; NaN if unknown.
@@ -74,7 +123,7 @@ class Cause(Found):
     """
 
     name: str
-    details: dict[str, Any] = field(default_factory=dict)
+    details: CauseDetails = CauseDetails()
     effect_rms: float = math.nan
     effect_max: float = math.nan
     told: bool = True
@@ -101,9 +150,15 @@ class Finding(Found):
     def details(self) -> dict[str, Any]:
         """What the kind has besides size and location, as in results."""
         own_fields = _own_fields(type(self))
-        return {
+        details = {
             name: value for name, value in asdict(self).items() if name in own_fields
         }
+        of_causes = {
+            name: value.to_dict()
+            for name, value in vars(self).items()
+            if isinstance(value, CauseDetails)
+        }
+        return details | of_causes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -424,7 +479,7 @@ class TakenForSlip(Finding):
     cause: str
     slip_in: str
     told: bool = True
-    of_cause: dict[str, Any] = field(default_factory=dict)
+    of_cause: CauseDetails = CauseDetails()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -628,6 +683,7 @@ def finding_to_dict(finding: Finding | Cause) -> dict[str, Any]:
     }
     if isinstance(finding, Cause):
         data |= {
+            "details": finding.details.to_dict(),
             "effect_rms": finding.effect_rms,
             "effect_max": finding.effect_max,
             "told": finding.told,

@@ -29,7 +29,7 @@ from selfcal_ros.estimation.verdict.roughness import _fitted_lines
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.findings import HarmonicsUntested
+from selfcal_ros.model.findings import CauseDetails, HarmonicsUntested
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Grade
@@ -340,7 +340,7 @@ def test_an_encoder_rougher_than_its_harmonics_is_named_and_covered():
         assert result.verdict.grade is Grade.ENLARGED
     assert len(found) == 12 and np.mean(inside) > 0.9
     cause = found[-1]
-    assert (cause.unit, cause.details) == ("rad", {"harmonics": 4})
+    assert (cause.unit, cause.details) == ("rad", CauseDetails(harmonics=4))
     assert (
         "a rotary encoder rougher than the 4 harmonics of its map can follow, by"
         in json.dumps(result_to_dict(worded(result)), ensure_ascii=False)

@@ -24,6 +24,7 @@ from selfcal_ros.model.budget import (
 )
 from selfcal_ros.model.findings import (
     Cause,
+    CauseDetails,
     FewRead,
     FewReadCell,
     InWords,
@@ -285,7 +286,7 @@ CAUSE = Cause(
     view="tx",
     axis="x",
     mark=(1, -2),
-    details={"part": "x x2"},
+    details=CauseDetails(part="x x2"),
     text="drift along x",
     effect_rms=2e-9,
     effect_max=6e-9,
@@ -330,7 +331,10 @@ def test_findings_come_back_as_what_they_are():
             view="a", read=(1, 0), asked=(9, 0), rejected={"late": 8}, text="out"
         ),
         TakenForSlip(
-            cause="drift", slip_in="a", of_cause={"part": "x P1"}, text="no slip"
+            cause="drift",
+            slip_in="a",
+            of_cause=CauseDetails(part="x P1"),
+            text="no slip",
         ),
         VisitedOnce(text="once"),
     )

@@ -8,7 +8,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.blocks import AXES, Block, Estimates, Located, Pattern, by_coefficient
+from selfcal_ros.blocks import (
+    AXES,
+    Block,
+    Estimates,
+    Located,
+    Pattern,
+    Where,
+    by_coefficient,
+)
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -29,8 +37,8 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
 
 def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield each axis."""
-    for fields, weights in by_coefficient(estimates, names):
-        yield {"axis": fields["details"]["part"]}, weights
+    for where, weights in by_coefficient(estimates, names):
+        yield Where(axis=where.part), weights
 
 
 BLOCK = Block(

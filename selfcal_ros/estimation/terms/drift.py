@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.polynomial.legendre import legval
 
-from selfcal_ros.blocks import AXES, Block, Estimates, Located, Pattern
+from selfcal_ros.blocks import AXES, Block, Estimates, Located, Pattern, Where
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -54,10 +54,8 @@ def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
                 ]
             )
             path = estimates.values @ shape
-            yield (
-                {"view": names[view], "axis": axis},
-                (shape[:, int(path.argmax())] - shape[:, int(path.argmin())]),
-            )
+            spread = shape[:, int(path.argmax())] - shape[:, int(path.argmin())]
+            yield Where(view=names[view], axis=axis), spread
 
 
 BLOCK = Block(

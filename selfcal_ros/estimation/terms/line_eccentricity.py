@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Estimates, Located, Pattern
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, Where
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -29,10 +29,8 @@ def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     for view in sorted({column.view for column in estimates.columns}):
         mine = np.array([column.view == view for column in estimates.columns])
         size = float(np.hypot.reduce(estimates.values[mine]))
-        yield (
-            {"view": names[view]},
-            np.where(mine, estimates.values, 0.0) / (size or 1.0),
-        )
+        weights = np.where(mine, estimates.values, 0.0) / (size or 1.0)
+        yield Where(view=names[view]), weights
 
 
 BLOCK = Block(

@@ -5,6 +5,7 @@ A reading has o where it should have (1 + E) o: V has -E o, E o = (s + ir) o + (
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,12 +27,9 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
 
 def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield every coefficient; of a rotation in rad."""
-    for fields, weights in by_coefficient(estimates, names):
-        component = fields["details"]["part"]
-        yield (
-            fields | {"unit": "rad" if component in ("turn", "shear") else "m/m"},
-            weights,
-        )
+    for where, weights in by_coefficient(estimates, names):
+        unit = "rad" if where.part in ("turn", "shear") else "m/m"
+        yield replace(where, unit=unit), weights
 
 
 BLOCK = Block(

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from selfcal_ros.blocks import Estimates, Located, Pattern
+from selfcal_ros.blocks import Estimates, Located, Pattern, Where
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -52,10 +52,7 @@ def against_first(estimates: Estimates, names: tuple[str, ...]) -> Located:
             c.view == 0 and c.component == column.component for c in estimates.columns
         ]
         if row.any():
-            yield (
-                {
-                    "view": names[column.view],
-                    "details": {"against": names[0], "part": column.component},
-                },
-                row,
+            where = Where(
+                view=names[column.view], against=names[0], part=column.component
             )
+            yield where, row

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotation: the plate turns between the marks and the lines of a view; Vtheta has r."""
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Estimates, Located, Pattern, differences
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, Where, differences
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -28,16 +27,9 @@ def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     at = int(distinctness.argmax())
     unit = np.eye(n)[at]
     weights = unit - (1 - unit) / max(n - 1, 1)
-    variance = max(float(weights @ estimates.covariance @ weights), 0.0)
     # u is that of the difference from the nearest
     nearest = abs(float(estimates.values @ weights)) / max(distinctness[at], 1e-300)
-    yield (
-        {
-            "view": names[estimates.columns[at].view],
-            "u": max(math.sqrt(variance), nearest),
-        },
-        weights,
-    )
+    yield Where(view=names[estimates.columns[at].view], least_u=nearest), weights
 
 
 BLOCK = Block(

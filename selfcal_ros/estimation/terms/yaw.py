@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Estimates, Located, Pattern, by_coefficient
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, Where, by_coefficient
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -78,7 +78,7 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
 def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the size of every node's."""
     return (
-        ({}, weights * np.sign(estimates.values))
+        (Where(), weights * np.sign(estimates.values))
         for _, weights in by_coefficient(estimates, names)
     )
 

@@ -16,7 +16,7 @@ returned: the readings do not determine which of them it is.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
@@ -24,7 +24,7 @@ from itertools import compress
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.blocks import AXES, Located, block_of, blocks, differences, traits_of
+from selfcal_ros.blocks import AXES, block_of, blocks, differences, traits_of
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
@@ -47,7 +47,7 @@ from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
-from selfcal_ros.model.findings import Cause
+from selfcal_ros.model.findings import Cause, CauseDetails
 from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm
@@ -245,7 +245,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
         u=float(u_of_effect[worst]),
         unit="m",
         p=p,
-        details={"away": places.distance * places.pitch_m},
+        details=CauseDetails(away=places.distance * places.pitch_m),
         effect_rms=rms(effect),
         effect_max=float(effect[worst]),
     )
@@ -765,14 +765,9 @@ def cause_of(explanation: Explanation, inputs: TermInputs) -> Cause:
     inputs : TermInputs
         Of the fit: names of the views, unit of a slip's rotation.
     """
-    names = inputs.names_of(explanation.name)
-    options = list(
-        _OTHERS[explanation.name](explanation, names, inputs.half_width_m)
-        if explanation.name in _OTHERS
-        else block_of(explanation.name).located(explanation, names)
-    )
-    fields, value, u = max(
-        ((fields, *_linear(explanation, weights)) for fields, weights in options),
+    candidates = list(_candidates(explanation, inputs))
+    cause, value, u = max(
+        ((cause, *_linear(explanation, weights)) for cause, weights in candidates),
         key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300),
     )
     largest = (
@@ -780,19 +775,46 @@ def cause_of(explanation: Explanation, inputs: TermInputs) -> Cause:
         if explanation.map_change is None
         else float(np.abs(explanation.map_change).max(initial=0.0))
     )
-    return Cause(
-        **{
-            "name": explanation.name,
-            "size": value,
-            "u": u,
-            "unit": traits_of(explanation.name).unit,
-            "p": explanation.p,
-            "effect_rms": explanation.effect_m,
-            "effect_max": largest,
-            "told": explanation.determined,
-            **fields,
-        }
+    return replace(
+        cause,
+        size=value,
+        u=float(np.fmax(cause.u, u)),
+        p=explanation.p,
+        effect_rms=explanation.effect_m,
+        effect_max=largest,
+        told=explanation.determined,
     )
+
+
+def _candidates(
+    explanation: Explanation, inputs: TermInputs
+) -> Iterator[tuple[Cause, np.ndarray]]:
+    """Yield what may size an explanation: a cause without its size, and the weights of values."""
+    name = explanation.name
+    names = inputs.names_of(name)
+    if name == READING:
+        if explanation.mark is None:
+            raise ValueError("a reading without its mark")
+        weights = explanation.values / np.hypot(*explanation.values)
+        view = names[explanation.columns[0].view]
+        yield Cause(name=name, unit="m", view=view, mark=explanation.mark), weights
+    elif name == SLIP:
+        view = names[explanation.columns[0].view]
+        details, toward = _slip(explanation, inputs.half_width_m)
+        yield Cause(name=name, unit="m", view=view, details=details), toward
+    else:
+        block = block_of(name)
+        for where, weights in block.located(explanation, names):
+            details = CauseDetails(part=where.part, against=where.against)
+            cause = Cause(
+                name=name,
+                u=where.least_u,
+                unit=where.unit or block.unit,
+                view=where.view,
+                axis=where.axis,
+                details=details,
+            )
+            yield cause, weights
 
 
 def fitted_term(
@@ -874,18 +896,10 @@ def _linear(explanation: Explanation, weights: np.ndarray) -> tuple[float, float
     return float(weights @ explanation.values), math.sqrt(max(variance, 0.0))
 
 
-def _reading(explanation: Explanation, names: tuple[str, ...], _: float) -> Located:
-    if explanation.mark is None:
-        raise ValueError("a reading without its mark")
-    yield (
-        {"view": names[explanation.columns[0].view], "mark": explanation.mark},
-        (explanation.values / np.hypot(*explanation.values)),
-    )
-
-
 def _slip(
-    explanation: Explanation, names: tuple[str, ...], half_width_m: float
-) -> Located:
+    explanation: Explanation, half_width_m: float
+) -> tuple[CauseDetails, np.ndarray]:
+    """Return the components of a slip, and the weights that give its length."""
     order = {column.component: i for i, column in enumerate(explanation.columns)}
     x, y, phi = (
         float(explanation.values[order[component]]) for component in ("x", "y", "phi")
@@ -895,22 +909,10 @@ def _slip(
     toward[order["x"]], toward[order["y"]] = (
         (x / size, y / size) if size else (1.0, 0.0)
     )
-    yield (
-        {
-            "view": names[explanation.columns[0].view],
-            "details": {
-                "after": explanation.share_before,
-                "x": x,
-                "y": y,
-                "phi": phi / half_width_m,
-            },
-        },
-        toward,
+    details = CauseDetails(
+        x=x, y=y, phi=phi / half_width_m, after=explanation.share_before
     )
-
-
-_OTHERS: dict[str, Callable[..., Located]] = {SLIP: _slip, READING: _reading}
-"""What is not a term: see `selfcal_ros.blocks.Block.located`."""
+    return details, toward
 
 
 def turned_too_far(

@@ -228,7 +228,7 @@ def _with_declared_zeros(
     """Return the causes; those of terms that were declared to be 0 say so."""
     zero = {str(term.name) for term in options.terms if term.size == 0}
     return tuple(
-        replace(cause, details={**cause.details, "declared": 0.0})
+        replace(cause, details=replace(cause.details, declared=0.0))
         if str(cause.name) in zero
         else cause
         for cause in causes

@@ -10,7 +10,7 @@ is the lack of fit, a part of the uncertainty at the nodes and between them (eq.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from scipy.special import fdtrc
@@ -27,7 +27,7 @@ from selfcal_ros.estimation.normal.angular import FLOOR, AngularSystem, Harmonic
 from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_residuals
 from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_everywhere
 from selfcal_ros.model.artifact import Interpolation
-from selfcal_ros.model.findings import Cause
+from selfcal_ros.model.findings import Cause, CauseDetails
 from selfcal_ros.model.kept import ROUGHNESS as NAME
 from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Measurements, turned_over
@@ -79,10 +79,10 @@ class Adequacy:
         """The cause `roughness`, if the map does not suffice."""
         if not self.p < F_LEVEL:
             return None
-        size: dict[str, Any] = (
-            {"harmonics": self.nodes[0]}
+        map_size = (
+            CauseDetails(harmonics=self.nodes[0])
             if self.of_lines
-            else {"nodes": list(self.nodes)}
+            else CauseDetails(nodes=self.nodes)
         )
         return Cause(
             name=NAME,
@@ -92,7 +92,7 @@ class Adequacy:
             p=self.p,
             effect_rms=self.lack,
             effect_max=self.lack,
-            details=size,
+            details=map_size,
         )
 
 

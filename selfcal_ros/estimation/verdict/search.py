@@ -45,7 +45,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
 )
 from selfcal_ros.model.error_map import rms
-from selfcal_ros.model.findings import Cause, Remedy
+from selfcal_ros.model.findings import Cause, CauseDetails, Remedy
 from selfcal_ros.model.kept import NOISE
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, merged
@@ -468,7 +468,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
         unit=largest.unit,
         p=test.p,
         view=largest.view,
-        details={"given": test.given},
+        details=CauseDetails(given=test.given),
     )
 
 
@@ -637,6 +637,6 @@ def _either_scale(
                 fitted_term(twin.joint, term.name), twin.joint.problem.inputs
             )
             causes[str(term.name)] = replace(
-                cause, details=cause.details | {"either": True}
+                cause, details=replace(cause.details, either=True)
             )
     return causes if len(causes) > 1 else {}

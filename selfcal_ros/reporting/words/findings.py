@@ -143,10 +143,10 @@ _STRAIN: dict[str, Callable[[Cause], str]] = {
 
 _CAUSES: dict[str, Callable[[Cause], str]] = {
     "microscope": lambda c: (
-        _MICROSCOPE[c.details["part"]](c)
+        _MICROSCOPE[c.details.part](c)
         + (
             f", or offsets of the lines too {_either(c, 'large', 'small')} by as much"
-            if c.details.get("either")
+            if c.details.either
             else ""
         )
     ),
@@ -155,15 +155,15 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
     ),
     "plate_scale": lambda c: (
         f"a plate {_either(c, 'larger', 'smaller')} by {plus_minus(c, RATIO)} in view '{c.view}' "
-        f"than in view '{c.details['against']}'"
+        f"than in view '{c.details.against}'"
     ),
     "plate_strain": lambda c: (
-        f"a plate {_STRAIN[c.details['part']](c)} by {plus_minus(c, RATIO)} in view '{c.view}' "
-        f"relative to view '{c.details['against']}'"
+        f"a plate {_STRAIN[c.details.part](c)} by {plus_minus(c, RATIO)} in view '{c.view}' "
+        f"relative to view '{c.details.against}'"
     ),
     "plate_shape": lambda c: (
         f"a plate bent by {plus_minus(c, UM)} at the middle of an edge in view '{c.view}' relative "
-        f"to view '{c.details['against']}'"
+        f"to view '{c.details.against}'"
         + ("" if c.told else ", part of which cannot be separated from the stage")
     ),
     "line_eccentricity": lambda c: (
@@ -174,7 +174,7 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
         f"offsets of the lines too {_either(c, 'small', 'large')} by {plus_minus(c, PERCENT)}"
         + (
             f", or a microscope that shows lengths too {_either(c, 'long', 'short')} by as much"
-            if c.details.get("either")
+            if c.details.either
             else ""
         )
     ),
@@ -187,8 +187,8 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
     ),
     "slip": lambda c: (
         "a plate that slipped by "
-        f"{_slipped(c.details['x'], c.details['y'], c.details['phi'])} after about "
-        f"{100 * c.details['after']:.0f} % of view '{c.view}'"
+        f"{_slipped(c.details.x, c.details.y, c.details.phi)} after about "
+        f"{100 * c.details.after:.0f} % of view '{c.view}'"
     ),
     "rotation": lambda c: (
         f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
@@ -199,14 +199,14 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
         f"'{c.view}' that is off by {plus_minus(c, UM if len(c.mark) > 1 else ARCSEC)}"
     ),
     "off_sites": lambda c: (
-        f"a stage that stood {c.details['away'] * MM_PER_M:.3g} mm off the sites, where its error "
+        f"a stage that stood {c.details.away * MM_PER_M:.3g} mm off the sites, where its error "
         f"differs by {plus_minus(c, UM)}"
     ),
     "roughness": lambda c: (
-        f"a rotary encoder rougher than the {c.details['harmonics']} harmonics of its map can "
+        f"a rotary encoder rougher than the {c.details.harmonics} harmonics of its map can "
         f"follow, by {c.size * ARCSEC_PER_RAD:.3g} arcsec (rms)"
         if c.unit == "rad"
-        else f"a stage rougher than the {' x '.join(map(str, c.details['nodes']))} nodes of its "
+        else f"a stage rougher than the {' x '.join(map(str, c.details.nodes))} nodes of its "
         f"map can follow, by {c.size * UM_PER_M:.3g} µm (rms)"
     ),
     "noise": lambda c: (
@@ -590,9 +590,9 @@ def what_it_is(cause: Cause) -> str:
     For a cause from a file without its data this is the whole text.
     """
     try:
-        if "given" in cause.details:
-            return _larger_term(cause, cause.details["given"])
-        declared = ", declared to be exactly zero" * ("declared" in cause.details)
+        if math.isfinite(cause.details.given):
+            return _larger_term(cause, cause.details.given)
+        declared = ", declared to be exactly zero" * (cause.details.declared == 0)
         return _cause_words(cause) + declared
     except (KeyError, TypeError, ValueError):
         if not cause.text:

@@ -294,7 +294,7 @@ def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(
         )
     )
     [cause] = result.verdict.causes
-    assert cause.name == "plate_shape" and ("declared" in cause.details) is is_declared
+    assert cause.name == "plate_shape" and (cause.details.declared == 0) is is_declared
     assert ("declared to be exactly zero" in result.verdict.sentence) is is_declared
 
 

@@ -17,6 +17,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.findings import (
     AxesNotMet,
     Cause,
+    CauseDetails,
     DrawnUncertainty,
     Finding,
     FiniteRotation,
@@ -281,7 +282,12 @@ def test_a_cause_in_words(found, text, size, u, unit):
 
 
 TURN = Cause(
-    name="microscope", size=2e-3, u=1e-5, unit="rad", p=1e-6, details={"part": "turn"}
+    name="microscope",
+    size=2e-3,
+    u=1e-5,
+    unit="rad",
+    p=1e-6,
+    details=CauseDetails(part="turn"),
 )
 SCALE = Cause(
     name="microscope",
@@ -289,13 +295,15 @@ SCALE = Cause(
     u=1e-3,
     unit="m/m",
     p=1e-6,
-    details={"part": "scale", "either": True},
+    details=CauseDetails(part="scale", either=True),
 )
 COMPARE = "compare the offset of a line at two angles of the rotary axis"
 CAUSES = [
     *(
         (
-            replace(SCALE, name="line_scale", size=size, details={"part": "scale"}),
+            replace(
+                SCALE, name="line_scale", size=size, details=CauseDetails(part="scale")
+            ),
             f"offsets of the lines too {how} by 5.00 ± 0.10 %: {COMPARE}",
         )
         for size, how in ((0.05, "small"), (-0.05, "large"))
@@ -356,14 +364,14 @@ CAUSES = [
             u=1e-9,
             unit="m",
             p=1e-6,
-            details={"away": 4.1e-4},
+            details=CauseDetails(away=4.1e-4),
         ),
         "a stage that stood 0.41 mm off the sites, where its error differs by 0.0200 ± 0.0010 µm: "
         "place the plate closer to its nominal pose, or send the stage to the sites",
     ),
     *(
         (
-            replace(TURN, details={"given": given}),
+            replace(TURN, details=CauseDetails(given=given)),
             f"a term 'microscope' as large as 2 mrad, {times} times the size assumed: {ALIGN}",
         )
         for given, times in ((1e-6, "2000"), (8e-4, "2.5"))
@@ -376,7 +384,7 @@ CAUSES = [
             unit="m/m",
             p=1e-6,
             view="90",
-            details={"given": 1e-6},
+            details=CauseDetails(given=1e-6),
         ),
         f"a term 'plate_strain' as large as 2 µm/m in view '90', 2 times the size assumed: {CLAMP}",
     ),
@@ -547,7 +555,7 @@ FINDINGS = [
             u=1e-5,
             unit="rad",
             cause="microscope",
-            of_cause={"part": "turn"},
+            of_cause=CauseDetails(part="turn"),
             slip_in="+x",
         ),
         "view '+x' looks as if the plate slipped, but the readings show a microscope turned "
@@ -682,7 +690,7 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
 
 
 def test_a_cause_of_a_file_without_its_data_is_its_text():
-    damaged = replace(TURN, details={}, text="as it was said")
+    damaged = replace(TURN, details=CauseDetails(), text="as it was said")
     assert what_it_is(damaged) == "as it was said"
 
 
