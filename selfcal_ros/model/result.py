@@ -285,11 +285,11 @@ def unidentified_result(
             v.view.name,
             v.view.rotation_rad,
             *v.view.translation_m,
-            nan,
-            nan,
-            nan,
-            v.used,
-            sum(v.rejected.values()),
+            phi=nan,
+            tx=nan,
+            ty=nan,
+            used=v.used,
+            rejected=sum(v.rejected.values()),
         )
         for v in measurements.views
     )

@@ -429,18 +429,20 @@ def read_simulation(path: str | Path) -> Simulation:
             "images are rendered of lattices, the plate is a list of marks",
             "leave camera out: simulate detections",
         )
+    correction, times = _correction(data.get("correction", {}), Path(path))
     return Simulation(
         plan,
-        top["seed"],
-        Spread(**read["truth"], **read["physics"]),
-        settings,
-        faults,
-        round(top["start_time"] * NS_PER_S),
-        top["compression"],
-        top["noise_seed"] if "noise_seed" in data else None,
-        _actual_poses(data.get("placed", []), plan, f"{where}: placed"),
-        camera,
-        *_correction(data.get("correction", {}), Path(path)),
+        seed=top["seed"],
+        spread=Spread(**read["truth"], **read["physics"]),
+        settings=settings,
+        faults=faults,
+        start_ns=round(top["start_time"] * NS_PER_S),
+        compression=top["compression"],
+        noise_seed=top["noise_seed"] if "noise_seed" in data else None,
+        placed=_actual_poses(data.get("placed", []), plan, f"{where}: placed"),
+        camera=camera,
+        correction=correction,
+        correction_times=times,
     )
 
 

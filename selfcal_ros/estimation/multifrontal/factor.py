@@ -133,15 +133,15 @@ def fold(
     cut_pins[place[pins[is_cut[pins]]]] = mean
     return RealSymmetricForm(
         *entries,
-        size,
-        free,
-        cut,
-        keys // 4,
-        PHASES[keys % 4],
-        PHASES[quadrant],
-        cut_pins,
-        variable,
-        relative_weight.reshape(read.shape),
+        size=size,
+        free=free,
+        cut=cut,
+        copy_of=keys // 4,
+        copy_phase=PHASES[keys % 4],
+        phase=PHASES[quadrant],
+        pins=cut_pins,
+        of_reading=variable,
+        shares=relative_weight.reshape(read.shape),
     )
 
 

@@ -73,24 +73,24 @@ def explaining(
     if standing is not None:
         return standing
     total = sum(isinstance(event, Detection) for event in events)
-    recorded = _outcome(Fault("", "", command, tuple(events)), settings)
+    recorded = _worth(Fault("", "", command, tuple(events)), settings)
     faults: list[Fault] = []
-    best = Outcome((recorded.used + total) / 2, -np.inf, 0, 0)
+    best = Worth((recorded.used + total) / 2, -np.inf, 0, 0)
     for fault in _faults(command, events, settings):
         try:
-            outcome = _outcome(fault, settings)
+            worth = _worth(fault, settings)
         except InputError:  # an even and an odd side do not lie so
             continue
         # without ids, positions in mm are all those of one mark
-        if outcome.seen < recorded.seen:
+        if worth.seen < recorded.seen:
             continue
         # any offset is small enough in another unit
-        if not outcome.following:
+        if not worth.following:
             continue
-        if outcome > best:
+        if worth > best:
             faults = []
-            best = outcome
-        if outcome == best:
+            best = worth
+        if worth == best:
             faults.append(fault)
     return (
         replace(
@@ -103,7 +103,7 @@ def explaining(
     )
 
 
-class Outcome(NamedTuple):
+class Worth(NamedTuple):
     """What messages are worth, the more the better.
 
     Attributes
@@ -124,7 +124,7 @@ class Outcome(NamedTuple):
     seen: int
 
 
-def _outcome(fault: Fault, settings: CollectorSettings) -> Outcome:
+def _worth(fault: Fault, settings: CollectorSettings) -> Worth:
     """Return what the messages would be worth without a fault."""
     collector = Collector(settings)
     collector.add_command(fault.command)
@@ -148,7 +148,7 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> Outcome:
         slope is not None and 1 / NEAR_FACTOR < -slope < NEAR_FACTOR for slope in slopes
     )
     has_stops = any(view.check_done for view in progress.values())
-    return Outcome(
+    return Worth(
         used=sum(view.used for view in views),
         faults=-len(wiring_faults(measurements)),
         following=following if has_stops else 2,
