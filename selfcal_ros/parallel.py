@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import forkserver, resource_tracker
-from typing import Any
+from typing import cast
 
 from threadpoolctl import threadpool_limits
 
@@ -40,11 +40,11 @@ def silent(n_done: int, total: int) -> None:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Outcome[R]:
     """Outcome of an item: its index, and a value or an error."""
 
     index: int
-    value: Any = None
+    value: R | None = None
     error: BaseException | None = None
 
 
@@ -110,13 +110,13 @@ def _start_server(module: str) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def outcomes(
-    function: Callable[[Any], Any],
-    items: Sequence[Any],
+def outcomes[T, R](
+    function: Callable[[T], R],
+    items: Sequence[T],
     *,
     workers: int = 1,
     dask: str = "",
-) -> Iterator[Outcome]:
+) -> Iterator[Outcome[R]]:
     """Yield the outcome of `function` for each item, as it becomes ready.
 
     Parameters
@@ -143,34 +143,34 @@ def outcomes(
         yield from _with_processes(function, items, min(workers, len(items)))
 
 
-def mapped(
-    function: Callable[[Any], Any],
-    items: Sequence[Any],
+def mapped[T, R](
+    function: Callable[[T], R],
+    items: Sequence[T],
     *,
     workers: int = 1,
     progress: Progress = silent,
-) -> list[Any]:
+) -> list[R]:
     """Return `function` of each item, in their order; the first error is raised.
 
     `progress` is called with the number of items done, and the total.
     """
-    results: list[Any] = [None] * len(items)
+    results: dict[int, R] = {}
     for n_done, outcome in enumerate(outcomes(function, items, workers=workers), 1):
         if outcome.error is not None:
             raise outcome.error
-        results[outcome.index] = outcome.value
+        results[outcome.index] = cast(R, outcome.value)
         progress(n_done, len(items))
-    return results
+    return [results[index] for index in range(len(items))]
 
 
-def mapped_in_parts(
-    function: Callable[[list[Any]], list[Any]],
-    items: Sequence[Any],
+def mapped_in_parts[T, R](
+    function: Callable[[list[T]], list[R]],
+    items: Sequence[T],
     *,
     workers: int = 1,
     size: int = 20,
     progress: Progress = silent,
-) -> list[Any]:
+) -> list[R]:
     """Return the results of `function` for lists of items, joined in their order.
 
     For items too small to be sent to a worker individually.
@@ -185,16 +185,18 @@ def mapped_in_parts(
     return [value for chunk in chunk_results for value in chunk]
 
 
-def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
+def _tried[T, R](
+    function: Callable[[T], R], items: Sequence[T], index: int
+) -> Outcome[R]:
     try:
         return Outcome(index, function(items[index]))
     except Exception as error:
         return Outcome(index, error=error)
 
 
-def _with_processes(
-    function: Callable[[Any], Any], items: Sequence[Any], workers: int
-) -> Iterator[Outcome]:
+def _with_processes[T, R](
+    function: Callable[[T], R], items: Sequence[T], workers: int
+) -> Iterator[Outcome[R]]:
     """Yield outcomes of a pool; if it breaks, each of its items is retried separately."""
     waiting = list(reversed(range(len(items))))
     while waiting:
@@ -221,9 +223,9 @@ def _with_processes(
             yield _in_own_process(function, items, index)
 
 
-def _in_own_process(
-    function: Callable[[Any], Any], items: Sequence[Any], index: int
-) -> Outcome:
+def _in_own_process[T, R](
+    function: Callable[[T], R], items: Sequence[T], index: int
+) -> Outcome[R]:
     """Return the outcome of an item in a separate process."""
     with _pool(1, function) as pool:
         future = pool.submit(function, items[index])
@@ -238,7 +240,7 @@ def _in_own_process(
         return _outcome(index, future)
 
 
-def _outcome(index: int, future: Any) -> Outcome:
+def _outcome[R](index: int, future: Future[R]) -> Outcome[R]:
     error = future.exception()
     return (
         Outcome(index, error=error)
@@ -256,9 +258,7 @@ def _method() -> str:
 
 
 @contextlib.contextmanager
-def _pool(
-    workers: int, function: Callable[[Any], Any]
-) -> Iterator[ProcessPoolExecutor]:
+def _pool(workers: int, function: Callable) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool whose processes have ended when the block ends, however it ends.
 
     The modules of `function` are imported once, before the workers are forked.
@@ -312,9 +312,9 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _with_dask(
-    function: Callable[[Any], Any], items: Sequence[Any], workers: int, address: str
-) -> Iterator[Outcome]:
+def _with_dask[T, R](
+    function: Callable[[T], R], items: Sequence[T], workers: int, address: str
+) -> Iterator[Outcome[R]]:
     """Yield outcomes of a dask cluster."""
     try:
         from distributed import Client, LocalCluster, as_completed  # an extra, large
@@ -350,6 +350,6 @@ def _with_dask(
             yield _outcome(futures[future], future)
 
 
-def _in_dask(function: Callable[[Any], Any], item: Any) -> Any:
+def _in_dask[T, R](function: Callable[[T], R], item: T) -> R:
     with threadpool_limits(limits=1, user_api="blas"):
         return function(item)
