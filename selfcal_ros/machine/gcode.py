@@ -3,8 +3,8 @@
 
 Positions are the machine's own coordinates: GRBL's MPos, the steps that Marlin counts, Klipper's
 M114, LinuxCNC's absolute actual position. Moves are G1 in mm with the feed rate of CELL.yaml, with
-G53 where the dialect has it. Modes of units,
-distances and feeds that a program left are set anew.
+G53 where the dialect has it. Modes of units, distances and feeds are set anew before each move: a
+pendant, another program, or a start-up line of GRBL after a reset may have changed them.
 """
 
 import contextlib
@@ -177,6 +177,8 @@ class _Talk:
 
     GREETING = ""
     """How the first line after a reset begins."""
+    MODES: tuple[str, ...] = ("G21 G90 G94",)
+    """Lines that set mm, absolute coordinates and mm/min."""
 
     def __init__(
         self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]
@@ -246,6 +248,10 @@ class _Talk:
             else:  # it is alive
                 deadline = time.monotonic() + timeout_s
 
+    def _set_modes(self) -> None:
+        for line in self.MODES:
+            self._ok(line)
+
     def _refuse(self, answer: str, line: str) -> None:
         """Raise if an answer is an error."""
         low = answer.lower()
@@ -280,7 +286,6 @@ class _Grbl(_Talk):
             raise MachineError(
                 "it reports positions in inches ($13=1)", "controller", "set $13=0"
             )
-        self._ok("G21 G90 G94")
 
     def _status(self) -> tuple[str, list[float]]:
         """Return the state, and the machine's position, mm."""
@@ -332,6 +337,7 @@ class _Grbl(_Talk):
         return self._status()[1]
 
     def move(self, travel: _Travel) -> None:
+        self._set_modes()
         self._ok(f"G53 G1 {travel.words}", travel.longest_s)
         deadline = time.monotonic() + travel.longest_s
         while self._status()[0] in MOTION_STATES:
@@ -358,11 +364,11 @@ class _Marlin(_Talk):
 
     QUERY, HALT, STEPS = "M114 R", b"M410\n", "M92"
     GREETING = "start"
+    MODES = ("G21", "G90")
 
     def _begin(self) -> None:
         self._lines.forget()
         self._ok("G21", 3 * PATIENCE_S)  # a board that was reset by opening the port
-        self._ok("G90")
         self._per_mm: dict[str, float] = {}
         for answer in self._ok(self.STEPS) if self.STEPS else ():
             self._per_mm |= {
@@ -403,6 +409,7 @@ class _Marlin(_Talk):
                 )
 
     def move(self, travel: _Travel) -> None:
+        self._set_modes()
         self._ok(f"G1 {travel.words}", travel.longest_s)
         self._ok("M400", travel.longest_s)
 
@@ -451,14 +458,9 @@ class _LinuxCnc(_Talk):
         self._set("verbose on", lines)
 
     def _take_over(self) -> None:
-        """Be the connection that is enabled, in mm and absolute coordinates."""
+        """Be the connection that is enabled."""
         self._is_enabled = True
-        for words in (
-            f"enable {self._passwords[1]}",
-            "mode mdi",
-            "set_wait done",
-            "mdi G21 G90 G94",
-        ):
+        for words in (f"enable {self._passwords[1]}", "mode mdi", "set_wait done"):
             self._set(words, self._lines)
 
     def _set(self, words: str, lines: Lines, timeout_s: float = PATIENCE_S) -> None:
@@ -496,6 +498,8 @@ class _LinuxCnc(_Talk):
     def move(self, travel: _Travel) -> None:
         if not self._is_enabled:
             self._take_over()
+        for line in self.MODES:
+            self._set(f"mdi {line}", self._lines)
         self._set(f"mdi G53 G1 {travel.words}", self._lines, travel.longest_s)
 
     def stop(self) -> None:

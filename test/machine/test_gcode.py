@@ -170,8 +170,33 @@ def test_a_feed_of_inverse_time_that_a_program_left_is_ended(dialect):
     """With G93 the first move would take a 6000th of a minute, however long it is."""
     firmware = KINDS[dialect]()
     with over_tcp(firmware) as port:
-        GcodeMachine(port, dialect, feed=6000.0).close()
-    assert any(line.endswith("G21 G90 G94") for line in firmware.lines)
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        machine.move_to((0.001, 0.0))
+        machine.close()
+    moves = [" G1 " in line for line in firmware.lines]
+    assert firmware.lines[moves.index(True) - 1].endswith("G21 G90 G94")
+
+
+@pytest.mark.parametrize(
+    ("dialect", "mode"),
+    [
+        ("grbl", "G20"),
+        ("linuxcnc", "G20"),
+        ("marlin", "G20"),
+        ("marlin", "G91"),
+        ("klipper", "G91"),
+    ],
+)
+def test_a_mode_that_another_sets_between_moves_changes_no_move(dialect, mode):
+    """A pendant, a program, or a start-up line of GRBL ($N0=G20), which each reset runs again."""
+    firmware = KINDS[dialect]()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        machine.move_to((0.002, 0.0))
+        firmware.set_modes(mode)
+        machine.move_to((0.003, 0.0))
+        machine.close()
+    assert firmware.at["X"] == pytest.approx(3.0)
 
 
 def test_a_marlin_whose_moves_count_from_another_zero_is_refused_and_not_moved():

@@ -25,6 +25,7 @@ class Firmware:
         self.at = {"X": 0.0, "Y": 0.0, "A": 0.0}
         self.lines, self.stopped, self.dead, self.alarm = [], 0, False, ""
         self.zero = 0.0  # of the x of moves, mm: G92, M206
+        self.unit_mm, self.relative = 1.0, False  # G20, G91
         self._moving = 0
 
     def session(self):
@@ -37,9 +38,18 @@ class Firmware:
     def byte(self, byte: bytes) -> bytes:
         raise AssertionError(byte)
 
+    def set_modes(self, line: str) -> None:
+        """Take the modes of a line; they last."""
+        codes = line.split()
+        if {"G20", "G21"} & {*codes}:
+            self.unit_mm = 25.4 if "G20" in codes else 1.0
+        if {"G90", "G91"} & {*codes}:
+            self.relative = "G91" in codes
+
     def move(self, line: str) -> None:
+        relative = self.relative and "G53" not in line
         self.at |= {
-            letter: float(value)
+            letter: float(value) * self.unit_mm + relative * self.at[letter]
             for letter, value in WORD.findall(line)
             if letter != "F"
         }
@@ -55,6 +65,7 @@ class Firmware:
             elif byte in b"\r\n":
                 line, rest[:] = rest.decode(), b""
                 self.lines.append(line)
+                self.set_modes(line)
                 out += self.answer(line)
             else:
                 rest += byte
@@ -189,6 +200,7 @@ class _Rsh(Firmware):
     def __init__(self, machine: LinuxCnc) -> None:
         super().__init__()
         self._machine, self.lines = machine, machine.lines
+        self.set_modes = machine.set_modes
         self._echo, self._verbose = True, False
 
     @property
