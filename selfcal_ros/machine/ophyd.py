@@ -3,6 +3,7 @@
 
 import contextlib
 import importlib
+import inspect
 import math
 from functools import partial, reduce
 from typing import Any
@@ -93,7 +94,7 @@ class OphydMachine:
         """Return the positions that the motors read back, m and rad."""
         values = []
         for axis, motor in self._motors.items():
-            value = _called(f"position of {axis}", lambda at=motor: at.position)
+            value = _called(f"position of {axis}", _present_position, motor)
             if value is None or not math.isfinite(float(value)):
                 raise MachineError(
                     f"its position is {value}", axis, "check its connection"
@@ -135,12 +136,12 @@ class OphydMachine:
         return []
 
     def stop(self) -> None:
-        """Stop all axes; raises MachineError of the first that cannot be."""
+        """Stop all axes; raises MachineError of the first that cannot be, or does not answer."""
         failed: list[MachineError] = []
-        for axis, motor in self._motors.items():
-            if hasattr(motor, "stop"):
+        for act in (_stop, _present_position):
+            for axis, motor in self._motors.items():
                 try:
-                    _called(axis, motor.stop)
+                    _called(axis, act, motor)
                 except MachineError as error:
                     failed.append(error)
         if failed:
@@ -148,6 +149,25 @@ class OphydMachine:
 
     def close(self) -> None:
         """Do nothing: the objects belong to their module."""
+
+
+def _stop(motor: Any) -> None:
+    """Stop a positioner, if it can be; an EPICS motor does not wait for the answer."""
+    if hasattr(motor, "stop"):
+        motor.stop()
+
+
+def _present_position(motor: Any) -> Any:
+    """Return the position of a positioner, asked for now.
+
+    `position` of EPICS is what its monitor told last: an old one, if the server hangs, or within
+    the deadband of the monitor (MDEL).
+    """
+    for name in ("user_readback", "readback"):
+        get = getattr(getattr(motor, name, None), "get", None)
+        if get and "use_monitor" in inspect.signature(get).parameters:
+            return get(use_monitor=False)
+    return motor.position
 
 
 def _require_unit(axis: str, motor: Any, stated: str) -> None:

@@ -3,6 +3,7 @@
 
 import multiprocessing
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 import pytest
 
+from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.ophyd import OphydMachine
 from selfcal_ros.settings.estimator import read_plan
@@ -43,19 +45,24 @@ def ioc(monkeypatch):
     monkeypatch.setenv("EPICS_CA_AUTO_ADDR_LIST", "NO")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     running = subprocess.Popen([sys.executable, "-c", IOC])
-    yield
-    running.terminate()
+    yield running.pid
+    running.kill()
     running.wait()
 
 
-def measure(folder):
-    """Measure a plan; return the largest error of the map."""
+def stage():
+    """Return the machine of the IOC's two motors."""
     from ophyd import EpicsMotor
 
     beamline = sys.modules["beamline"] = types.ModuleType("beamline")
     beamline.x, beamline.y = (EpicsMotor(f"stage:{name}", name=name) for name in "xy")
+    return OphydMachine("beamline:x", "beamline:y")
+
+
+def measure(folder):
+    """Measure a plan; return the largest error of the map."""
     cell, simulated = write_cell(folder, plan=FEW, camera=True, simulation=QUIET)
-    machine = OphydMachine("beamline:x", "beamline:y")
+    machine = stage()
 
     def image():
         simulated.move_to((*machine.position(), 0.0))
@@ -70,7 +77,30 @@ def measure(folder):
     return np.abs(away).max()
 
 
-def test_a_plan_is_measured_with_motor_records(ioc, tmp_path):
-    """In a process of its own: the library reads its environment once."""
+def said_of_hanging(pid) -> list[str]:
+    """Return what is said of position and stop while the IOC hangs."""
+    machine = stage()
+    machine.move_to((0.001, 0.0))
+    os.kill(pid, signal.SIGSTOP)
+    said = []
+    for act in (machine.position, machine.stop):
+        with pytest.raises(MachineError) as error:
+            act()
+        said.append(str(error.value))
+    return said
+
+
+def in_a_process(function, value):
+    """Return what a function returns; the library reads its environment once."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        assert pool.submit(measure, tmp_path).result() < 5e-8
+        return pool.submit(function, value).result()
+
+
+def test_a_plan_is_measured_with_motor_records(ioc, tmp_path):
+    assert in_a_process(measure, tmp_path) < 5e-8
+
+
+def test_an_ioc_that_hangs_has_no_position_and_cannot_be_stopped(ioc):
+    """Channel Access notices it after half a minute, and goes on telling the last position."""
+    for line in in_a_process(said_of_hanging, ioc):
+        assert "Failed to read stage:x.RBV" in line
