@@ -16,6 +16,7 @@ from selfcal_ros.reporting.summary.numbers import with_u
 from selfcal_ros.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
+from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE
 from selfcal_ros.vision.exposures import ImageDetector
 
 SIZE_OPTION = "--mark-pixels"
@@ -87,6 +88,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Follow the marks, print the camera, write the parameters."""
+    require_pixels(args.mark_pixels)
+    if not args.mark_size > 0:
+        raise InputError(
+            "--mark-size", f"{args.mark_size:g} is not a size", "give it in m"
+        )
     settings = DetectorSettings.checked(
         {  # offsets in pixels
             "pixel_size": 1.0,
@@ -136,6 +142,16 @@ def run(args: argparse.Namespace) -> int:
         },
     )
     return 0
+
+
+def require_pixels(size_px: float) -> None:
+    """Refuse a size of a mark in pixels in which none is found."""
+    if not SMALLEST_SIZE <= size_px <= LARGEST_SIZE:
+        raise InputError(
+            SIZE_OPTION,
+            f"{size_px:g} is not a size of a mark in pixels",
+            f"give {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}",
+        )
 
 
 def pose_text(camera: "CameraPose", output: str) -> str:

@@ -9,13 +9,13 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from selfcal_ros.cli.camera import pose_text
+from selfcal_ros.cli.camera import pose_text, require_pixels
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
-from selfcal_ros.outputs import write_bytes
+from selfcal_ros.outputs import check_outputs, write_bytes
 from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.reporting.summary.numbers import counted, with_u
 from selfcal_ros.settings.estimator import read_plan
@@ -42,7 +42,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--mark-pixels",
         metavar="PX",
         type=float,
-        default=0.0,
         help="size of a mark in the image, pixels; default: it is searched for",
     )
     attempt.add_argument("--yes", action="store_true", help="move without asking")
@@ -95,13 +94,16 @@ def run(args: argparse.Namespace) -> int:
 
 def _try(args: argparse.Namespace) -> int:
     """Look, move after a yes, write what was found into CELL.yaml."""
+    if args.mark_pixels is not None:
+        require_pixels(args.mark_pixels)
     cell = read_cell(args.cell)
     output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
+    check_outputs([args.cell], [output])
     with (
         ended_by_signals(),
         connected(cell, lambda line: print(line, file=aside(args))) as machine,
     ):
-        trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
+        trial = Trial(cell, machine, mark_pixels=args.mark_pixels or 0.0)
         try:
             pixels, marks = trial.look()
         except NoDataError:

@@ -234,7 +234,8 @@ def _reference(text: str | None) -> dict[str, Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
-    check_outputs([args.bag, args.params], [file_of(args), args.report])
+    plate_from = getattr(args, "plate_from", None)  # of a recheck
+    check_outputs([args.bag, args.params, plate_from], [file_of(args), args.report])
     if args.report:
         from selfcal_ros.reporting.report import check_name  # loads every figure
 

@@ -201,11 +201,13 @@ class Run:
     def _take_up(self) -> list[Command]:
         """Continue an interrupted run where it stood; no commands if it is in the middle of one."""
         where = str(self.bag)
-        if not any(self.bag.glob("*.mcap")):
+        names = [path.name for path in self.bag.glob("*.mcap")]
+        # files of another name would be left out, and written over in the list of the bag
+        if not names or not all(name.startswith(f"{self.bag.name}_") for name in names):
             raise InputError(
                 where,
-                "not a bag of an interrupted run",
-                "remove it, or name another folder",
+                "not the bag of an interrupted run, or it was renamed",
+                "name another folder, or give it its former name",
             )
         self._journal = Claim(self.bag).resume()
         if self._journal is None:

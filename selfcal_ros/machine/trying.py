@@ -226,7 +226,7 @@ class Trial:
         visitor.first_move(marks=False, step_m=self.step_m)
         start = visitor.sample()
         self._home = dict(zip(start.names, start.positions, strict=True))
-        has_image = self.mark_pixels > 0
+        has_image = self.seen is not None
         self._per_pixel: Callable[[np.ndarray], np.ndarray] = lambda offset: offset
         camera = self._camera() if has_image else None
         if camera is not None:

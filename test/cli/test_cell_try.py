@@ -151,6 +151,30 @@ def test_the_picture_shows_what_was_rejected_and_the_line_why(
         assert (np.asarray(picture) == REJECTED).all(axis=2).sum() > 50
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mark-pixels", "3"], "--mark-pixels: 3 is not a size of a mark in pixels"),
+        (["-o", "cell.yaml"], "cell.yaml: would be overwritten"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_moves(
+    tmp_path, monkeypatch, capsys, options, said
+):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path)
+    before = (tmp_path / "cell.yaml").read_text()
+    assert main(["cell", "try", "cell.yaml", "--yes", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert (tmp_path / "cell.yaml").read_text() == before
+
+
+def test_a_machine_without_a_camera_needs_no_size_in_pixels(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_cell(tmp_path)
+    assert main(["cell", "try", "cell.yaml", "--yes", "--mark-pixels", "20"]) == 0
+
+
 def test_marks_in_another_unit_move_nothing(tmp_path, monkeypatch, capsys):
     """The first moves are by the size of a mark, here 50 for 50e-6."""
     monkeypatch.chdir(tmp_path)

@@ -55,6 +55,15 @@ def folder(tmp_path_factory):
     return folder
 
 
+def test_the_calibration_is_not_overwritten(folder, capsys):
+    plate = folder / "r.json"
+    before = plate.read_bytes()
+    given = [str(plate), str(folder / "same"), "-o", str(plate)]
+    assert main(["recheck", *given, "--force"]) == 2
+    assert "r.json: would be overwritten" in capsys.readouterr().err
+    assert plate.read_bytes() == before
+
+
 def test_a_stage_that_is_as_it_was(folder, capsys):
     out = folder / "same.json"
     assert (

@@ -266,6 +266,16 @@ def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
         )
 
 
+def test_a_renamed_bag_is_not_begun_anew(tmp_path):
+    """The readings of its files of the former name would be left out."""
+    cell, machine = write_cell(tmp_path)
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    run_of(tmp_path, machine, cell).measure()
+    (tmp_path / "bag" / "bag_0.mcap").rename(tmp_path / "bag" / "monday_0.mcap")
+    with pytest.raises(InputError, match="or it was renamed; name another folder"):
+        run_of(tmp_path, machine, cell).measure(resume=True)
+
+
 def test_a_clock_that_was_set_back_does_not_continue(tmp_path):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
