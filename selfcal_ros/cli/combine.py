@@ -18,10 +18,9 @@ from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.parts import Combined, CombinedRun
 from selfcal_ros.model.result import CalibrationResult, created_now, result_to_dict
 from selfcal_ros.outputs import check_outputs, write_json
-from selfcal_ros.reporting.summary.numbers import p_text
+from selfcal_ros.reporting.summary.numbers import arcsec, p_text, um
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.results import read_result
-from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -91,15 +90,14 @@ def _text(result: CalibrationResult) -> str:
     u = [rms(emap.u_gx), rms(emap.u_gy)]
     lines = [
         f"mean of {len(figures.runs)} maps: {result.verdict.sentence}",
-        f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
-        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {figures.u_between_m * UM_PER_M:.3g} "
-        f"µm rms, {p_text(figures.p_between)}",
+        f"XY     U {um(noise.k_xy * math.hypot(*u) / math.sqrt(2))} rms "
+        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {um(figures.u_between_m)} rms, "
+        f"{p_text(figures.p_between)}",
     ]
     if figures.u_between_rad is not None and figures.p_between_theta is not None:
         lines.append(
-            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
-            f"rms (k = {noise.k_theta:.3g}), between runs "
-            f"{figures.u_between_rad * ARCSEC_PER_RAD:.3g} arcsec rms, "
+            f"theta  U {arcsec(noise.k_theta * rms(emap.u_g_theta))} rms "
+            f"(k = {noise.k_theta:.3g}), between runs {arcsec(figures.u_between_rad)} rms, "
             f"{p_text(figures.p_between_theta)}"
         )
     lines.append("each map against the mean of the others:")

@@ -23,7 +23,7 @@ from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.figures.maps import difference_picture
-from selfcal_ros.reporting.summary.numbers import p_text
+from selfcal_ros.reporting.summary.numbers import p_text, with_u
 from selfcal_ros.reporting.summary.sections import enlargement_texts
 from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
@@ -272,12 +272,11 @@ def _laser_text(rows: Sequence[LaserDifference]) -> str:
     lines = ["first-order terms, map and laser:"]
     for row in rows:
         unit = "µrad" if row.name == "nonorthogonality" else "µm/m"
-        test = (
-            "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, {p_text(row.p)}"
-        )
+        difference = with_u(row.difference * UM_PER_M, row.u * UM_PER_M, sign="+")
+        test = "" if math.isnan(row.u) else f" (k=1), {p_text(row.p)}"
         lines.append(
             f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "
             f"{row.of_laser * UM_PER_M:+.4g} {unit}, difference "
-            f"{row.difference * UM_PER_M:+.4g}{test}"
+            f"{difference} {unit}{test}"
         )
     return "\n".join(lines)

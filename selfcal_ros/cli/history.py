@@ -2,6 +2,7 @@
 """``selfcal history``: the calibrations of a stage, the active map, and when the next is due."""
 
 import argparse
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,9 +14,9 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference
 from selfcal_ros.estimation.comparison.verification import require_correctable
 from selfcal_ros.outputs import plain, write_text
-from selfcal_ros.reporting.summary.numbers import map_figures
+from selfcal_ros.reporting.summary.numbers import map_figures, um, with_u
 from selfcal_ros.results import ACTIVE, active_map, read_result
-from selfcal_ros.units import NM_PER_M, UM_PER_M
+from selfcal_ros.units import UM_PER_M
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -96,7 +97,7 @@ def _text(
         grade = "" if entry.result.verdict.qualified else ", not qualified"
         yield (
             f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<13}"
-            f"{_largest_m(entry) * UM_PER_M:>12.4g} µm{entry.expanded_m * NM_PER_M:>9.3g} nm  "
+            f"{um(_largest_m(entry)):>15}{um(entry.expanded_m):>12}  "
             f"{_change_text(entry.change)}  {entry.path.relative_to(folder)}{grade}"
         )
     if used is None:
@@ -109,18 +110,15 @@ def _text(
 def _change_text(change: MapDifference | str) -> str:
     if isinstance(change, str):
         return f"not compared: {change}" if change else "-"
-    u = (
-        ("", "")
+    u_largest, u_rms = (
+        (math.nan, math.nan)
         if change.xy is None
-        else (
-            f" ± {change.xy.u_largest * NM_PER_M:.2g}",
-            f" ± {change.xy.u_rms * NM_PER_M:.2g}",
-        )
+        else (change.xy.u_largest, change.xy.u_rms)
     )
     clear = {True: "changed", False: "within u", None: "u unknown"}[change.significant]
     return (
-        f"{change.max_m * NM_PER_M:.3g}{u[0]} nm, {change.rms_m * NM_PER_M:.3g}{u[1]} nm "
-        f"(k=1), {clear}"
+        f"{with_u(change.max_m * UM_PER_M, u_largest * UM_PER_M)} µm, "
+        f"{with_u(change.rms_m * UM_PER_M, u_rms * UM_PER_M)} µm (k=1), {clear}"
     )
 
 
@@ -128,14 +126,14 @@ def _drift_text(drift: Drift | None) -> str:
     if drift is None:
         return "drift: nothing to compare with the active map; recheck the stage to learn it"
     day = (
-        f"{drift.per_day_m * NM_PER_M:.3g} ± {drift.u_per_day_m * NM_PER_M:.2g} nm a day (k=1)"
+        f"{with_u(drift.per_day_m * UM_PER_M, drift.u_per_day_m * UM_PER_M)} µm a day (k=1)"
         if drift.is_clear
-        else f"none beyond its uncertainty, so below {drift.most_per_day_m * NM_PER_M:.2g} nm a day"
+        else f"none beyond its uncertainty, so below {um(drift.most_per_day_m)} a day"
     )
     if drift.due is None:
         return f"drift from the active map: {day}; it will not reach U"
     return (
-        f"drift from the active map: {day}; it reaches U, {drift.limit_m * NM_PER_M:.3g} nm, "
+        f"drift from the active map: {day}; it reaches U, {um(drift.limit_m)}, "
         f"{'on' if drift.is_clear else 'not before'} {drift.due:%Y-%m-%d %H:%M}: the next "
         "calibration is due then"
     )

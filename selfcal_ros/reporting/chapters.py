@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.reference import reference_to_dict
@@ -45,7 +46,7 @@ from selfcal_ros.reporting.summary.numbers import (
 )
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.findings import advice, what_it_is
-from selfcal_ros.reporting.words.phrases import dof_text, line_text
+from selfcal_ros.reporting.words.phrases import dof_text, line_text, recheck_lines
 from selfcal_ros.reporting.words.quantities import unit_of
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
@@ -476,14 +477,24 @@ def _causes(result: CalibrationResult) -> Chapter:
                 (("verdict", verdict.sentence),) if verdict.sentence else (),
                 notes=tuple(f"failed: {reason}" for reason in verdict.reasons),
             ),
+            _change(result),
             Section(
                 "Likely causes, the most likely first",
                 table=(header, *rows) if rows else (),
             ),
             sections.terms_section(result),
-            sections.noise_section(result.noise),
+            sections.noise_section(result),
         ),
     )
+
+
+def _change(result: CalibrationResult) -> Section:
+    """Return what a recheck found; nothing of another result."""
+    recheck = result.recheck
+    if recheck is None:
+        return Section("Change")
+    title = f"Change since {printable(recheck.of)}"
+    return Section(title, notes=tuple(recheck_lines(recheck)))
 
 
 MAP = "Map"

@@ -75,6 +75,9 @@ def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
         "weighted mean of several calibrations" in page
         and "uncertainties of 3 runs" in page
     )
+    # it has no views, readings or noise of its own
+    assert "Mean of 3 maps: largest error" in page and "mean of 3 maps</td>" in page
+    assert not any(word in page for word in ("0 views", "0 used", "not known"))
     of_one, of_mean = (
         load(name).length_error((0.0, 0.0), (0.02, 0.01))[1]
         for name in ("1.json", "mean.json")

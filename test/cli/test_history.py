@@ -91,8 +91,9 @@ def test_the_next_is_due_when_the_drift_reaches_u(folder, capsys):
     assert "* 2026-03-01 08:00  calibration" in capsys.readouterr().out
     found = told(folder, capsys)
     drift = found["drift"]
-    emap = read_result(folder / "a.json").error_map
-    limit = 2 * np.sqrt(np.mean([emap.u_gx**2, emap.u_gy**2]))
+    result = read_result(folder / "a.json")
+    emap = result.error_map
+    limit = result.noise.k_xy * np.sqrt(np.mean([emap.u_gx**2, emap.u_gy**2]))
     assert drift["limit_m"] == pytest.approx(limit)
     per_day = 2e-8 * np.sqrt(np.mean(((ARTIFACT.m / 2.0) ** 2 - 0.5) ** 2) / 2)
     assert drift["clear"] and drift["per_day_m"] == pytest.approx(per_day, rel=0.2)

@@ -94,6 +94,9 @@ def test_a_stage_that_is_as_it_was(folder, capsys):
     assert data["warnings"] == []
     assert main(["diff", str(folder / "r.json"), str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["significance_xy"]["correlated"] is True
+    assert main(["report", str(out), "-o", str(folder / "same.html")]) == 0
+    page = (folder / "same.html").read_text()
+    assert "Change since" in page and "detectable in 9 of 10 cases" in page
 
 
 def test_the_calibrations_own_recording_is_refused(folder, capsys):

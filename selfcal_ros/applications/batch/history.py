@@ -53,7 +53,8 @@ class Entry:
     def expanded_m(self) -> float:
         """U of the map at its nodes, root mean square, m."""
         emap = self.result.error_map
-        return COVERAGE * float(np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))))
+        u_rms_m = np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy])))
+        return self.result.noise.k_xy * float(u_rms_m)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from selfcal_ros.reporting.figures.drawing import (
 )
 from selfcal_ros.reporting.figures.svg import inline_svg
 from selfcal_ros.reporting.report import page
-from selfcal_ros.reporting.summary.numbers import decimals_for, fixed
+from selfcal_ros.reporting.summary.numbers import decimals_for, fixed, with_u
 
 STYLE = """td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }
 details { margin: 1rem 0; } summary { cursor: pointer; color: var(--c0); margin-bottom: .6rem; }
@@ -192,9 +192,8 @@ def _figure(series: PlanHistory, name: str, span: Span) -> str:
         drawing.discs(
             [frame.at(day, value)], 3.0, fill="bad" if record["exit_code"] else "good"
         )
-        label = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(
-            spread > 0
-        )
+        size = with_u(value, 2 * spread) if spread > 0 else f"{value:.6g}"
+        label = f"{record['bag']}: {size} {unit}"
         drawing.spot(*frame.at(day, value), 6, label)
     _finding(frame, series, values, series.courses[name])
     caption = f"{text}{', ' * bool(unit)}{unit}" + (

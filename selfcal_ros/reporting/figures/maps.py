@@ -17,7 +17,12 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
-from selfcal_ros.reporting.summary.numbers import UNKNOWN, significant, truth_arrays
+from selfcal_ros.reporting.summary.numbers import (
+    UNKNOWN,
+    significant,
+    truth_arrays,
+    with_u,
+)
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -307,18 +312,13 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
             float(values[index]) * MM_PER_M for values in (artifact.x_m, artifact.y_m)
         )
         gx, gy, ux, uy = (
-            significant(float(values[index]) * scale)
-            for values, scale in (
-                (emap.gx, UM_PER_M),
-                (emap.gy, UM_PER_M),
-                (emap.u_gx, k * UM_PER_M),
-                (emap.u_gy, k * UM_PER_M),
-            )
+            float(values[index]) * UM_PER_M
+            for values in (emap.gx, emap.gy, emap.u_gx, emap.u_gy)
         )
         words = (
-            UNKNOWN
-            if gx == UNKNOWN
-            else (f"{name}x {gx} ± {ux} µm, {name}y {gy} ± {uy} µm (k = {k:.3g})")
+            f"{name}x {with_u(gx, k * ux)} µm, {name}y {with_u(gy, k * uy)} µm (k = {k:.3g})"
+            if math.isfinite(gx)
+            else UNKNOWN
         )
         frame.drawing.spot(
             *frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}"
@@ -455,8 +455,8 @@ def angular_map(
             drawing.spot(
                 *_at(angles[i], error[i], span),
                 7,
-                f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} ± "
-                f"{significant(u[i])} arcsec (k = {k:.3g})",
+                f"line {i}, {math.degrees(angles[i]):.6g}°: "
+                f"{with_u(error[i], u[i])} arcsec (k = {k:.3g})",
             )
     _scale(drawing, span)
     parts.legend(drawing, entries, (90, CENTRE[1] + 220))

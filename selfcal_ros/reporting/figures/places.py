@@ -18,7 +18,7 @@ from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
 from selfcal_ros.reporting.figures.residuals import places_mm
-from selfcal_ros.reporting.summary.numbers import significant
+from selfcal_ros.reporting.summary.numbers import with_u
 from selfcal_ros.reporting.summary.sections import pose_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 
@@ -267,8 +267,7 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
         [place, error * UM_PER_M, u * UM_PER_M]
     ).T:
         words = (
-            f"{significant(dx)} ± {significant(ux)} µm, {significant(dy)} ± "
-            f"{significant(uy)} µm (k = {result.noise.k_xy:.3g})"
+            f"{with_u(dx, ux)} µm, {with_u(dy, uy)} µm (k = {result.noise.k_xy:.3g})"
         )
         drawing.spot(*frame.at(x, y), 12.0, f"x {x:.4g} mm, y {y:.4g} mm: {words}")
     parts.arrow_key(frame, factor, (LEFT, TOP + SIDE + 58))
@@ -313,8 +312,7 @@ def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
         drawing.spot(
             *frame.at(a, b),
             0.9 * min(dx * frame.per_x, dy * frame.per_y),
-            f"x {a:.4g} mm, y {b:.4g} mm: {significant(value)} ± {significant(spread)} "
-            f"µrad (k = {k:.3g})",
+            f"x {a:.4g} mm, y {b:.4g} mm: {with_u(value, spread)} µrad (k = {k:.3g})",
         )
     drawing.height = TOP + height + 46
     return drawing

@@ -39,15 +39,15 @@ def significant(value: float, digits: int = 3) -> str:
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
 
-def with_u(value: float, u: float) -> str:
+def with_u(value: float, u: float, *, sign: str = "") -> str:
     """Return a value ± its uncertainty, this with two digits, and both with its decimals.
 
-    Without a finite uncertainty it is the value alone.
+    Without a finite uncertainty it is the value alone. With `sign` ``+`` a value above 0 has one.
     """
     if not math.isfinite(u):
         return significant(value)
     decimals = decimals_for([u], 2) if u > 0 else 3
-    return f"{value:.{decimals}f} ± {u:.{decimals}f}"
+    return f"{value:{sign}.{decimals}f} ± {u:.{decimals}f}"
 
 
 def um(value_m: float) -> str:

@@ -15,7 +15,7 @@ from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.findings import ViewLeftOut
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import to_ascii
 from selfcal_ros.reporting.summary.numbers import (
@@ -40,7 +40,7 @@ from selfcal_ros.reporting.summary.numbers import (
 )
 from selfcal_ros.reporting.words.findings import assumption_text
 from selfcal_ros.reporting.words.phrases import counted_views, dof_text, of_few_read
-from selfcal_ros.reporting.words.quantities import unit_of
+from selfcal_ros.reporting.words.quantities import size_of, unit_of
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -64,7 +64,7 @@ def all_sections(
         views_section(result),
         error_section(result),
         terms_section(result),
-        noise_section(result.noise),
+        noise_section(result),
         Section("Camera", camera_facts(result)),
     ]
     if truth is not None:
@@ -116,10 +116,15 @@ def terms_section(result: CalibrationResult) -> Section:
         of_images = block is not None and block.of_images
         if of_images or (term.source == "default" and term.size_used is None):
             continue  # part of the camera, or a line of the budget
-        how = "free" if term.size is None else f"size {term.size:g}"
-        if term.size_used is not None:
-            how += f", too small: {term.size_used:.2g} used"
         for item in term.estimates:
+            how = (
+                "free"
+                if term.size is None
+                else f"size {size_of(term.name, item.unit, term.size)}"
+            )
+            if term.size_used is not None:
+                used = size_of(term.name, item.unit, term.size_used)
+                how += f", too small: {used} used"
             scale, unit = unit_of(term.name, item.unit)
             value, u = item.value * scale, item.u * scale
             # two figures of u, and the value to the same place
@@ -162,7 +167,10 @@ def measurement_section(result: CalibrationResult) -> Section:
     measured_names = {
         without_cell(view.name) for view in filter(_in_the_map(result), result.views)
     }
-    views = f"{counted_views(result.views)}, {len(measured_names)} measured"
+    views = (
+        _mean_text(result)
+        or f"{counted_views(result.views)}, {len(measured_names)} measured"
+    )
     facts = [
         ("plan", f"{result.plan_id or UNKNOWN}: {views}"),
         (
@@ -189,11 +197,17 @@ def measurement_section(result: CalibrationResult) -> Section:
             f"{result.method}, {result.sense.replace('_', ' ')}, "
             f"{result.model.misalignment} misalignments",
         ),
-        (
-            "identifiable",
-            f"{'yes' if observability.identifiable else 'NO'} (rank "
-            f"{observability.rank} of {observability.unknowns} unknowns, "
-            f"{counted(observability.deficiency, 'undetermined mode')})",
+        *(
+            []
+            if result.parts.combined
+            else [
+                (
+                    "identifiable",
+                    f"{'yes' if observability.identifiable else 'NO'} (rank "
+                    f"{observability.rank} of {observability.unknowns} unknowns, "
+                    f"{counted(observability.deficiency, 'undetermined mode')})",
+                )
+            ]
         ),
     ]
     plate_map = result.artifact_map
@@ -422,8 +436,14 @@ def _spread_facts(
     return facts
 
 
-def noise_section(noise: Noise) -> Section:
-    """Return the noise of one reading: used, from repeats, from residuals, and their ratio."""
+def noise_section(result: CalibrationResult) -> Section:
+    """Return the noise of one reading: used, from repeats, from residuals, and their ratio.
+
+    A mean of maps has no readings of its own.
+    """
+    if result.parts.combined:
+        return Section("Noise")
+    noise = result.noise
     rows = []
     for label, name, scale, unit in (
         ("x, y", "xy", UM_PER_M, "µm"),
@@ -507,7 +527,9 @@ def _in_u(in_u: float, largest_in_u: float, within: float) -> list[tuple[str, st
 
 
 def rejected_section(result: CalibrationResult) -> Section:
-    """Return rejected detections by reason, most frequent first."""
+    """Return rejected detections by reason, most frequent first; nothing of a mean of maps."""
+    if result.parts.combined:
+        return Section("Rejected detections")
     counts = sorted(result.rejected.items(), key=lambda item: (-item[1], item[0]))
     total = sum(result.rejected.values())
     used = sum(v.used for v in result.views)
@@ -595,6 +617,12 @@ def state_line(result: CalibrationResult) -> str:
     return f"{lead}: {'; '.join((line, *map(printable, reasons[:1])))}."
 
 
+def _mean_text(result: CalibrationResult) -> str:
+    """Return ``mean of 2 maps``; nothing for a map of readings."""
+    mean = result.parts.combined
+    return "" if mean is None else f"mean of {counted(len(mean.runs), 'map')}"
+
+
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = (
         f" at {figures.n_known} of {figures.n_sites} sites"
@@ -604,7 +632,8 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     views = counted_views(result.views, _in_the_map(result)) + of_few_read(
         result.findings
     )
-    text = f"Calibrated{share} from {views}"
+    mean = _mean_text(result)
+    text = f"{mean.capitalize()}{share}" if mean else f"Calibrated{share} from {views}"
     if not figures.n_known:
         return text
     k = result.noise.k_xy

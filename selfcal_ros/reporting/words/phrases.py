@@ -36,7 +36,7 @@ from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
-from selfcal_ros.reporting.summary.numbers import counted, p_text
+from selfcal_ros.reporting.summary.numbers import counted, p_text, with_u
 from selfcal_ros.reporting.words.quantities import size_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
@@ -237,7 +237,7 @@ def _changed(since: str, clearest: str, p: float) -> str:
 
 def _scale_changed(since: str, scale: ScaleChange, *, one_pass: bool) -> str:
     how_much = (
-        f"by {scale.change * UM_PER_M:+.3g} ± {scale.u * UM_PER_M:.2g} µm/m (k=1, "
+        f"by {with_u(scale.change * UM_PER_M, scale.u * UM_PER_M, sign='+')} µm/m (k=1, "
         f"{p_text(scale.p)})"
     )
     if one_pass:
@@ -269,15 +269,15 @@ def other_plate_text(finding: OtherPlate) -> str:
 def _clearest(of: LargestChange) -> str:
     return (
         f"clearest at x = {of.x * MM_PER_M:.6g}, y = {of.y * MM_PER_M:.6g} mm: "
-        f"{of.change * UM_PER_M:+.3f} ± {of.u * UM_PER_M:.3f} µm along {of.axis} (k=1)"
+        f"{with_u(of.change * UM_PER_M, of.u * UM_PER_M, sign='+')} µm along {of.axis} (k=1)"
     )
 
 
 def recheck_lines(recheck: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
     out = [
-        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, "
-        f"u {recheck.u_rms * UM_PER_M:.5f} µm, {p_text(recheck.p_xy)}"
+        f"XY     rms {with_u(recheck.rms * UM_PER_M, recheck.u_rms * UM_PER_M)} µm per axis "
+        f"(k=1), {p_text(recheck.p_xy)}"
     ]
     if (sizes := recheck.detectable) is not None:
         out.append(
@@ -287,7 +287,7 @@ def recheck_lines(recheck: Recheck) -> list[str]:
     if (turn := recheck.largest_theta) is not None:
         out.append(
             f"theta  clearest at line {turn.line}: "
-            f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
+            f"{with_u(turn.change * ARCSEC_PER_RAD, turn.u * ARCSEC_PER_RAD, sign='+')} "
             f"arcsec (k=1), {p_text(recheck.p_theta)}"
         )
     if recheck.passes == 1:
@@ -295,7 +295,7 @@ def recheck_lines(recheck: Recheck) -> list[str]:
     scale = recheck.scale
     return [
         *out,
-        f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
+        f"scale  {with_u(scale.change * UM_PER_M, scale.u * UM_PER_M, sign='+')} µm/m "
         f"against the plate (k=1), {p_text(scale.p)}",
     ]
 
@@ -318,11 +318,16 @@ def changed_or_microscope_text(finding: ChangedOrMicroscope) -> str:
     return (
         f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
         f"({p_text(finding.p)}); a changed stage, or a microscope with a scale wrong by "
-        f"{100 * finding.scale:+.1f} % ± {100 * finding.u_scale:.1f} % and turned by "
-        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad (k=1) "
+        f"{with_u(100 * finding.scale, 100 * finding.u_scale, sign='+')} % and turned by "
+        f"{_turn(finding)} mrad (k=1) "
         "explains it alike: measure check stops (check_stops in the plan), or correct the "
         "pixel size"
     )
+
+
+def _turn(finding: ChangedOrMicroscope | MicroscopeOff) -> str:
+    """Return the turn of a microscope in mrad, with its u."""
+    return with_u(finding.turn * MRAD_PER_RAD, finding.u_turn * MRAD_PER_RAD, sign="+")
 
 
 def changed_or_marks_text(finding: ChangedOrMarks) -> str:
@@ -340,9 +345,9 @@ def changed_or_marks_text(finding: ChangedOrMarks) -> str:
 def microscope_off_text(finding: MicroscopeOff) -> str:
     """Return the warning of a microscope that is not as assumed, which the readings correct."""
     return (
-        f"the scale of the microscope is wrong by {100 * finding.size:+.2f} % ± "
-        f"{100 * finding.u:.2f} % and it is turned by "
-        f"{finding.turn * MRAD_PER_RAD:+.3g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad "
+        "the scale of the microscope is wrong by "
+        f"{with_u(100 * finding.size, 100 * finding.u, sign='+')} % and it is turned by "
+        f"{_turn(finding)} mrad "
         "(k=1), as visits of one mark at several places show: the readings were corrected by "
         "that; correct the pixel size before the next calibration"
     )

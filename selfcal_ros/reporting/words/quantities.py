@@ -41,6 +41,10 @@ def unit_of(name: str, si: str) -> DisplayUnit:
 
 def size_text(line: BudgetLine, size_si: float) -> str:
     """Return a size of the term of a line of the budget, with its unit."""
-    name = line.component.removeprefix(TERM)
-    unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, line.unit)
+    return size_of(line.component.removeprefix(TERM), line.unit, size_si)
+
+
+def size_of(name: str, si: str, size_si: float) -> str:
+    """Return a size of a term, whose coefficients have the unit `si`, with its unit."""
+    unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, si)
     return f"{size_si * unit.per_si:.3g} {unit.name}".rstrip()

@@ -266,7 +266,7 @@ def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_o
     words = [item.text for item in drawing.items if isinstance(item, Label)]
     assert "U at the nodes, k = 2.5" in words
     told = next(item.title for item in drawing.items if isinstance(item, Spot))
-    assert "± 0.750 µm" in told and "± 0.250 µm (k = 2.5)" in told
+    assert "± 0.75 µm" in told and "± 0.25 µm (k = 2.5)" in told
 
 
 def test_a_map_without_one_known_site_says_so():

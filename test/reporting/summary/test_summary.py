@@ -363,7 +363,8 @@ def test_terms_of_the_model_are_shown_with_their_uncertainties():
     assert line_with(text, "drift").split() == [
         "drift",
         "(size",
-        "5e-08)",
+        "0.05",
+        "µm)",
         "rot90",
         "x",
         "P1",
