@@ -601,6 +601,7 @@ class SolvingSession:
         verdict = self.shown.result.verdict
         doubts = [
             self._newer(self._planned),
+            self._lacking(),
             "" if verdict.qualified else verdict.sentence,
         ]
         doubts += self.shown.result.warnings
@@ -624,6 +625,18 @@ class SolvingSession:
         return (
             f"the newer run {run.run_id} of plan '{run.plan_id}' is not in this map: none of "
             "its readings has arrived; the health of measurement_collector says why"
+        )
+
+    def _lacking(self) -> str:
+        """Return a note on planned views that are not in the published map; "" if none."""
+        n_done, n_planned = self.shown.views_done, self._planned_views(self.shown.run)
+        is_loaded = not self.shown.digest
+        if is_loaded or n_done >= n_planned:
+            return ""
+        return (
+            f"{n_done} of {n_planned} views of the plan are in this map: the readings of the "
+            "others have not arrived; measure them, or have measurement_collector send what it "
+            "has (finish)"
         )
 
     def load(self, path: str) -> str:

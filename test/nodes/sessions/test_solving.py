@@ -737,6 +737,23 @@ def test_a_saved_map_tells_that_it_is_not_qualified_and_what_it_lacks(tmp_path):
     )
 
 
+def test_a_saved_map_tells_of_views_whose_readings_never_came(tmp_path):
+    """They were lost on the way, or their collector died before this solver was started."""
+    desk = Desk(result_folder=str(tmp_path))
+    views = views_of(small_plan("0, 90, tx, ty"))
+    desk.session.take_command(command(len(views), plan_id=views[0].plan_id))
+    desk.take(views[:3] + views[4:])
+    assert desk.session.result.verdict.qualified
+    line, _ = desk.session.save("map.json")
+    assert (
+        "; WARNING: 4 of 5 views of the plan are in this map: the readings of" in line
+    )
+    desk.take(views)
+    assert "WARNING" not in desk.session.save("map.json")[0]
+    desk.session.load(str(tmp_path / "map.json"))
+    assert "WARNING" not in desk.session.save("map.json")[0]
+
+
 def test_readings_of_a_run_of_the_future_are_refused(desk):
     desk.take(views_of(run_id=str(NOW)))
     with pytest.raises(
