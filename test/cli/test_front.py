@@ -12,6 +12,7 @@ import pytest
 
 from selfcal_ros.cli.main import EXTRAS, build_parser, main
 from selfcal_ros.cli.verbs import EXAMPLES, GROUPS, START_HERE, VERBS, Verb, module_of
+from test.support.pages import PAGES
 from test.support.sources import ROOT
 from test.support.terminals import SELFCAL, in_terminal
 
@@ -61,6 +62,19 @@ def leaves(parser, words=()):
     for group in groups:
         for word, sub in group._name_parser_map.items():
             yield from leaves(sub, (*words, word))
+
+
+def test_every_option_has_a_page():
+    text = " ".join(page.read_text() for page in PAGES)
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", text))
+    options = {
+        option
+        for verb in VERBS
+        for _, leaf in leaves(build_parser(verb))
+        for option in leaf._option_string_actions
+        if option.startswith("--")
+    }
+    assert options - {"--output"} <= named  # it is written as -o
 
 
 @pytest.mark.parametrize("verb", VERBS)
