@@ -55,6 +55,7 @@ WANTED = {
     "POINTS.csv": TABLE,
     "MAP.csv": TABLE,
     "DATA.csv": TABLE,
+    "FILE.csv": TABLE,
     "IN": PROGRAM,
 }
 """Name of an argument -> kind of file that it stands for."""

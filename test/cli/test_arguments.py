@@ -28,10 +28,12 @@ def desk(tmp_path, monkeypatch):
 
 
 def verb_of(words):
-    """Return what an error begins with: of `cal` and `plan` the second word, too."""
+    """Return what an error begins with: of `cal`, `plan` and `camera` the second word, too."""
     first, second, *_ = words.split()
     return (
-        f"selfcal {first} {second}" if first in ("cal", "plan") else f"selfcal {first}"
+        f"selfcal {first} {second}"
+        if first in ("cal", "camera", "plan")
+        else f"selfcal {first}"
     )
 
 
@@ -120,6 +122,11 @@ def test_kinds_are_seen_in_the_files(desk):
         (
             "solve R.json",
             "R.json: is a result, and a bag is needed here; `selfcal report R.json` shows it",
+        ),
+        (
+            "camera init bags/camera --positions R.json --mark-size 1e-5 --mark-pixels 9 -o n.yaml",
+            "R.json: is a result, and a table of numbers is needed here; `selfcal report "
+            "R.json` shows it",
         ),
         (
             "report bags/demo",
