@@ -20,6 +20,7 @@ from selfcal_ros.collection.marks.repeats import (
     grid_visits,
     reduce_repeats,
     repeat_motion,
+    without_turning,
 )
 from selfcal_ros.collection.marks.rigid import Rigid
 from selfcal_ros.collection.marks.stops import without_aside
@@ -550,6 +551,7 @@ def _reduce_angular(
         residual=residual[None],
     )
     _count(rejected, Reason.OUTLIER, means.outlier)
+    means = without_turning(means, k, v[None], sigma=d["sigma"])
     # of the axis relative to the line, without full turns
     place = identify.wrap(v - d["offset_theta"])
     motion = repeat_motion(k, place[None], d["offset_theta"][None], means.outlier)

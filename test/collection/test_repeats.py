@@ -15,6 +15,7 @@ from selfcal_ros.collection.marks.repeats import (
     median,
     reduce_repeats,
     row_medians,
+    without_turning,
 )
 
 SIGMA = 2e-8
@@ -327,3 +328,43 @@ def test_distances():
     np.testing.assert_array_equal(
         distances(np.array([[3e-9, -5.0, 0.0], [4e-9, 12.0, 0.0]])), [5e-9, 13.0, 0.0]
     )
+
+
+def lines_read(
+    turning, *, lines=24, passes=3, consecutive=False, seed=0, sigma_rad=2e-6
+):
+    """Return readings of lines of a plate that turns by `turning` (in -1..1 of the view), rad."""
+    key = np.arange(lines * passes)
+    key = key // passes if consecutive else key % lines
+    noise = np.random.default_rng(seed).normal(0, sigma_rad, (1, len(key)))
+    return key, noise + turning(np.linspace(-1, 1, len(key))), np.zeros(len(key))
+
+
+def means_of_lines(*read):
+    key, values, sigma = read
+    return without_turning(reduce_repeats(*read, limit=0), key, values, sigma=sigma)
+
+
+@pytest.mark.parametrize("passes", [2, 3, 5])
+def test_a_plate_that_turns_slowly_is_no_noise_of_its_lines(passes):
+    def turning(part):
+        return 2e-5 * part - 3e-5 * part**2
+
+    means = means_of_lines(*lines_read(turning, passes=passes))
+    assert means.sigma == pytest.approx(2e-6, rel=0.3)
+    assert means.dof == 24 * (passes - 1) - 2
+    away = means.mean[0] - means.mean[0].mean()
+    assert away.std() < 1.3 * 2e-6 / np.sqrt(passes)
+
+
+def test_lines_of_a_plate_that_rests_keep_their_means():
+    changed = 0
+    for seed in range(300):
+        read = lines_read(np.zeros_like, passes=2, lines=8, seed=seed)
+        changed += means_of_lines(*read).dof != reduce_repeats(*read, limit=0).dof
+    assert changed <= 15  # 6 expected at 2 %
+
+
+def test_successive_repeats_of_lines_do_not_determine_a_turning():
+    read = lines_read(lambda part: 1e-3 * part, consecutive=True)
+    assert means_of_lines(*read).dof == 48

@@ -31,6 +31,11 @@ STEPS = 3
 """Steps of a sensor by which otherwise identical repeats may differ."""
 SLOW = 5
 """Degree of the polynomial of the order of the readings that is taken out of their changes."""
+TURNS = 2
+"""Degree of the polynomial of the order that is taken out of lines: as slow as a plate turns. Two
+passes determine it so well that the means become noisier by a fortieth."""
+TURNS_LEVEL = 0.02
+"""Probability by chance (F-test) below which repeats of lines show that all of them turn."""
 FOLLOWS = 3.0
 """Change of the deviation over that of the stage's position up to which an outlier among repeats
 may come of the microscope's wiring: reversed offsets make 2 of it, doubled ones 1."""
@@ -421,6 +426,47 @@ def grid_visits(
 def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Return which visits have more than one value, bool array (visits,)."""
     return np.bincount(visit, values != values[first][visit], len(first)) > 0
+
+
+def without_turning(
+    means: Means, key: np.ndarray, values: np.ndarray, *, sigma: np.ndarray
+) -> Means:
+    """Return the means of lines without a slow turning of all of them, if their repeats show one.
+
+    The fit knows the visits of marks and takes their drift out; lines have none. A turning would
+    count as noise of their repeats, and hide as much of what residuals show. Only passes determine
+    it: successive repeats of a line do not.
+
+    Parameters
+    ----------
+    means : Means
+        Result of `reduce_repeats` for the same readings.
+    key : int array (n,)
+        Index of the line of each reading, in the order of the stamps.
+    values : float array (1, n)
+        Readings, rad.
+    sigma : float array (n,)
+        Declared standard uncertainties, rad; 0 = not declared.
+    """
+    kept = ~means.outlier
+    key, values = key[kept], values[:, kept]
+    dof = means.dof - TURNS
+    if dof <= 0 or np.count_nonzero(np.diff(key)) + 1 < 2 * len(means.key):
+        return means
+    about = _about_means(key, values)
+    order = np.linspace(-1, 1, len(key))
+    slow = np.polynomial.legendre.legvander(order, TURNS)[:, 1:].T
+    slow_about = _about_means(key, slow)
+    size = np.linalg.lstsq(slow_about.T, about[0], rcond=None)[0]
+    left = float(((about[0] - size @ slow_about) ** 2).sum())
+    total = float((about**2).sum())
+    # the F-test of two coefficients, in closed form
+    if not (0 < left < total and (left / total) ** (dof / 2) < TURNS_LEVEL):
+        return means
+    steady = average(key, values - size @ slow, sigma[kept])
+    return replace(
+        steady, sigma=float(np.sqrt(left / dof)), dof=dof, outlier=means.outlier
+    )
 
 
 def repeat_motion(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from selfcal_ros.collection.inputs import Kind, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.joint.model_fit import fit_model
@@ -21,6 +22,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
+from test.support.collecting import collect, scene
 from test.support.options import BARE, bare
 from test.support.results import covered
 from test.support.truth import hu_plan, simulate_measurements
@@ -239,3 +241,33 @@ def test_one_common_view_tells_nothing():
 
 def test_lines_without_noise_turn_by_rounding_alone():
     assert calibrate(measured(1, 0.0), BARE).verdict.causes == ()
+
+
+def test_a_plate_that_turns_while_its_lines_are_read_hides_no_other_fault():
+    """A turning inflates the scatter of repeats by as much as an error of the circle residuals."""
+    sigma_rad = 1e-5
+    cell = scene(
+        "0, 90, tx", count=24, line=True, repeats=2, seed=4, sigma_theta_rad=sigma_rad
+    )
+    readings, _ = collect(cell.events)
+    assert calibrate(readings).verdict.grade is Grade.GOOD
+
+    begun = [one.stamp_ns for one in cell.commands if one.phase is Phase.MEASURE]
+    stamps = np.array([one.stamp_ns for one in cell.detections])
+    lines = np.array([one.kind == Kind.ANGULAR for one in cell.detections])
+    for view, rng in enumerate(map(np.random.default_rng, range(len(begun)))):
+        of_view = np.flatnonzero(
+            lines & (np.searchsorted(begun, stamps) == view + 1)
+        ).tolist()
+        size, phase = rng.normal(), rng.uniform(0, 2 * np.pi)
+        for index, part in zip(of_view, np.linspace(-1, 1, len(of_view)), strict=True):
+            line = cell.detections[index]
+            turning = 4 * (-1) ** view * (part**2 - 1 / 3)
+            oval = 2 * size * np.cos(4 * np.pi * line.k / 24 + phase)
+            cell.spoil(
+                index, offset_theta=line.offset_theta + sigma_rad * (turning + oval)
+            )
+    readings, _ = collect(cell.events)
+    noise = calibrate(readings).noise
+    assert noise.sigma_theta_repeats < 1.3 * sigma_rad
+    assert not calibrate(readings).verdict.qualified
