@@ -110,7 +110,8 @@ class Cause(Found):
     Attributes
     ----------
     name : str
-        Name of a term, or ``slip``, ``reading``, ``off_sites``, ``roughness`` or ``noise``.
+        Name of a term, or ``slip``, ``reading``, ``off_sites``, ``roughness``, ``reversal`` or
+        ``noise``.
     details : CauseDetails
         Further data of its sentence.
     effect_rms, effect_max : float

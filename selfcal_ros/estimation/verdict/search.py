@@ -33,6 +33,7 @@ from selfcal_ros.estimation.verdict.causes import (
     scatter_of_views,
     turned_too_far,
 )
+from selfcal_ros.estimation.verdict.reversal import reversal_of
 from selfcal_ros.estimation.verdict.roughness import (
     adequacy_of,
     line_adequacy_of,
@@ -122,6 +123,7 @@ def search_causes(
     raised, alike = _add_raised_sizes(search, measurements, options)
     turned = _add_turned_lines(search, measurements)
     _add_roughness(search, measurements, options, advise=advise)
+    _add_reversal(search)
     if off_sites is not None:
         _add_off_sites(search, off_sites, measurements)
     plausible = all(map(_is_plausible, search.solved.joint.sizes))
@@ -201,6 +203,18 @@ def _add_roughness(
             nodes = _better_map(measurements, options)
         remedies = (Remedy("map", nodes),) if nodes else ()
         search.causes.append(replace(cause, remedies=remedies))
+
+
+def _add_reversal(search: SearchResult) -> None:
+    """Add a reversal that differs from site to site, if it matters for the map."""
+    result = search.solved.result
+    reversal = reversal_of(search.solved.joint)
+    if reversal is None:
+        return
+    effect = reversal.effect(result)
+    if rms(effect.xy) > MATTERS * rms(result.error_map.u_xy):
+        search.effects.append(effect)
+        search.causes.append(reversal.cause(effect))
 
 
 def _add_off_sites(

@@ -185,6 +185,10 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"
     ),
+    "reversal": lambda c: (
+        f"an indicated {c.axis} whose change with the direction of approach differs by up to "
+        f"±({plus_minus(c, UM)}) from place to place"
+    ),
     "slip": lambda c: (
         "a plate that slipped by "
         f"{_slipped(c.details.x, c.details.y, c.details.phi)} after about "
@@ -225,6 +229,7 @@ _ACTIONS = {
     "line_scale": "compare the offset of a line at two angles of the rotary axis",
     "yaw": "declare a larger yaw:SIZE",
     "approach": "approach each mark from the same side",
+    "reversal": "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
     "rotation": "check whether the plate moved between marks and lines, and the sign of the "
     "lines' offsets",
