@@ -297,7 +297,7 @@ def recheck(
         placed_plate=solved.measurements.artifact.placed,
         recheck=outcome,
     )
-    return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
+    return replace(result, budget=tuple(_budget(result, solved, plate)))
 
 
 def _failed(
@@ -781,63 +781,78 @@ def _with_coverage(
 
 
 def _budget(
-    result: CalibrationResult, variances: dict[str, np.ndarray], plate: KnownPlate
+    result: CalibrationResult, solved: Rechecked, plate: KnownPlate
 ) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
-    noise = result.noise
-    of_plate = plate.result.artifact_map
-    inf = float("inf")
+    of_plate, of_lines = plate.result.artifact_map, solved.lines
+    yield from _sources(
+        ("xy", "m"),
+        solved.variances,
+        np.stack([of_plate.u_ax, of_plate.u_ay]),
+        result,
+        plate,
+    )
+    if len(of_lines.values):
+        variances = {
+            name: np.maximum(cover.diagonal(), 0.0)
+            for name, cover in of_lines.covariances(0.0).items()
+            if name != TEMPERATURE  # which turns no line
+        }
+        yield from _sources(
+            ("theta", "rad"), variances, of_plate.u_a_theta, result, plate
+        )
+    yield from (
+        line for line in budget_lines(result) if line.component == INTERPOLATION
+    )
+
+
+def _sources(
+    quantity_and_unit: tuple[str, str],
+    variances: dict[str, np.ndarray],
+    u_of_plate: np.ndarray,
+    result: CalibrationResult,
+    plate: KnownPlate,
+) -> Iterator[BudgetLine]:
+    """Yield a line of the budget for each source of the variances of a map."""
+    quantity, unit = quantity_and_unit
+    noise, inf = result.noise, float("inf")
+    sigma = getattr(noise, f"sigma_{quantity}")
     by = next(
         (
             way
             for way in ("declared", "repeats")
-            if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy
+            if getattr(noise, f"sigma_{quantity}_{way}") == sigma
         ),
         "residuals",
     )
+    u_of_length = float(np.sqrt(plate.variance_of_length))
+    dof_of_plate = plate.result.noise.dof_of(quantity)
     rows: dict[str, tuple[str, float, str, float, str]] = {
-        NOISE: ("A", noise.sigma_xy, "m", noise.dof_xy, "readings"),
-        PLATE: (
-            "A",
-            rms(np.stack([of_plate.u_ax, of_plate.u_ay])),
-            "m",
-            plate.result.noise.dof_of("xy"),
-            "declared",
-        ),
-        TEMPERATURE: (
-            "B",
-            float(np.sqrt(plate.variance_of_length)),
-            "m/m",
-            inf,
-            "declared",
-        ),
-        TERMS: ("B", float("nan"), "m", inf, "default"),
+        NOISE: ("A", sigma, unit, getattr(noise, f"dof_{quantity}"), "readings"),
+        PLATE: ("A", rms(u_of_plate), unit, dof_of_plate, "declared"),
+        TEMPERATURE: ("B", u_of_length, "m/m", inf, "declared"),
+        TERMS: ("B", float("nan"), unit, inf, "default"),
     }
     for name, variance in variances.items():
         if name == TEMPERATURE and plate.reference is None:
             continue
-        kind, u, unit, dof, source = rows[name]
+        kind, u, unit_of_u, dof, source = rows[name]
         u_map = np.sqrt(variance)
         details: Details = OfPlate(plate.where)
         if name == NOISE:
             details = OfNoise(by, contradicted=False)
         yield BudgetLine(
-            quantity="xy",
+            quantity=quantity,
             component=name,
             kind=kind,
             u=u,
-            unit=unit,
+            unit=unit_of_u,
             effect_rms=rms(u_map),
             effect_max=float(u_map.max()),
             dof=dof,
             source=source,
             details=details,
         )
-    yield from (
-        line
-        for line in budget_lines(result)
-        if (line.quantity, line.component) == ("xy", INTERPOLATION)
-    )
 
 
 @dataclass(frozen=True, eq=False)
