@@ -110,7 +110,7 @@ def reversal_of(model: ModelFit) -> Reversal | None:
 
     information = np.where(known, sums.information, 1.0)
     product = np.where(known, sums.product, 0.0)
-    total = np.maximum((information * known).sum(axis=1), 1.0)
+    total = np.where(n_known > 0, (information * known).sum(axis=1), 1.0)
     mean_m = product.sum(axis=1) / total
     of_sites = (product**2 / information).sum(axis=1)
     variance = (sums.squares - of_sites) / dof
