@@ -133,23 +133,12 @@ def test_it_matters_where_a_site_is_approached_from_one_side(sense):
 def with_visits(view, some):
     """Return a view with some of its visits; each mark keeps one."""
     visits = view.visits
-    kept = replace(
-        visits,
-        **{
-            name: getattr(visits, name)[some]
-            for name in (
-                "mark",
-                "dx",
-                "dy",
-                "count",
-                "stamp_ns",
-                "offset_x",
-                "offset_y",
-                "approach_x",
-                "approach_y",
-            )
-        },
-    )
+    columns = {
+        name: values[some]
+        for name, values in vars(visits).items()
+        if np.shape(values) == some.shape
+    }
+    kept = replace(visits, **columns)
     count = np.bincount(kept.mark, kept.count, len(view.m))
     return replace(
         view,
