@@ -29,6 +29,14 @@ class ViewCourse:
     dy: np.ndarray
     count: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if the columns differ in length, or a value is not finite."""
+        columns = (self.time_s, self.dx, self.dy)
+        if {len(column) for column in columns} != {len(self.count)}:
+            raise ValueError("the columns of a course differ in length")
+        if not np.isfinite(columns).all():
+            raise ValueError("a value of a course is not finite")
+
 
 @dataclass(frozen=True, eq=False)
 class ViewResiduals:
@@ -69,6 +77,13 @@ class RejectedAt:
     x: np.ndarray
     y: np.ndarray
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if reasons and places differ in number."""
+        if not len(self.reason) == len(self.x) == len(self.y):
+            raise ValueError(
+                "reasons and places of rejected detections differ in number"
+            )
+
 
 @dataclass(frozen=True)
 class Removed:
@@ -95,6 +110,11 @@ class Removed:
     leverage: float
     residual_m: float = float("nan")
     residual_rad: float = float("nan")
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if the mark is not one of its kind."""
+        if len(self.mark) != (2 if self.kind == "grid" else 1):
+            raise ValueError(f"{self.mark} is not a mark of the kind {self.kind!r}")
 
 
 @dataclass(frozen=True)

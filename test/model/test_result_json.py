@@ -194,6 +194,16 @@ def test_what_a_correction_did_is_read_as_it_was_written():
     assert again.verification.axes["y"] == AXIS and not again.extra
 
 
+COURSE = {"time_s": [0.0, 1.0], "dx": [0.0, 0.0], "dy": [0.0, 0.0], "count": [1, 1]}
+REMOVED = {
+    "view": "a",
+    "kind": "grid",
+    "mark": [0, 0],
+    "standardised": 9,
+    "leverage": 0,
+}
+
+
 def damaged(path, value):
     data = copy.deepcopy(result_to_dict(known_result(5, 8)[0]))
     at = data
@@ -232,6 +242,26 @@ def damaged(path, value):
         (("residuals",), {"views": [{"dx": []}]}, "the key 'view' is missing"),
         (("rejected_at",), [7], "7 is not of type dict"),
         (("slips",), {}, "{} is not of type list"),
+        (
+            ("rejected_at",),
+            [{"view": "a", "reason": ["late"], "x": [], "y": []}],
+            "reasons and places of rejected detections differ in number",
+        ),
+        (
+            ("residuals",),
+            {"views": [{"view": "a", "course": COURSE | {"count": [1]}}]},
+            "the columns of a course differ in length",
+        ),
+        (
+            ("residuals",),
+            {"views": [{"view": "a", "course": COURSE | {"dx": [None, 0.0]}}]},
+            "a value of a course is not finite",
+        ),
+        (
+            ("outliers",),
+            {"rule": "", "unchecked": 0, "removed": [REMOVED | {"mark": [1]}]},
+            "(1,) is not a mark of the kind 'grid'",
+        ),
     ],
 )
 def test_damaged_results_are_refused(path, value, message):

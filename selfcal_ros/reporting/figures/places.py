@@ -160,14 +160,16 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
     places = [
         (rejected.view, reason, float(x * MM_PER_M), float(y * MM_PER_M))
         for rejected in result.parts.rejected_at or ()
-        for reason, x, y in zip(rejected.reason, rejected.x, rejected.y, strict=False)
+        for reason, x, y in zip(rejected.reason, rejected.x, rejected.y, strict=True)
         if np.isfinite(x) and np.isfinite(y)
     ]
     views = {view.name: view for view in result.views}
     outliers = result.parts.outliers
     for removed in outliers.removed if outliers else ():
         view = views.get(removed.view)
-        if view is not None and removed.kind == "grid":
+        if view is None or removed.kind != "grid":
+            continue
+        if result.plate.marks is None or result.plate.has(*np.array(removed.mark)):
             places.append(_of_outlier(result.plate, view, removed.mark))
     return places
 
