@@ -218,6 +218,17 @@ _CAUSES: dict[str, Callable[[Cause], str]] = {
     ),
 }
 
+_OF_DETAILS = {
+    "microscope",
+    "plate_scale",
+    "plate_strain",
+    "plate_shape",
+    "slip",
+    "off_sites",
+    "roughness",
+}
+"""Causes whose sentences need their details."""
+
 _ACTIONS = {
     "microscope": "align the microscope, or have the stage stop next to the marks deliberately "
     "(check_stops)",
@@ -594,6 +605,8 @@ def what_it_is(cause: Cause) -> str:
 
     For a cause from a file without its data this is the whole text.
     """
+    if cause.text and cause.name in _OF_DETAILS and not cause.details.to_dict():
+        return cause.text
     try:
         if math.isfinite(cause.details.given):
             return _larger_term(cause, cause.details.given)

@@ -689,8 +689,22 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     assert views == [verdict.causes[0].view] == [ODD] == [verdict.failed[0].view]
 
 
-def test_a_cause_of_a_file_without_its_data_is_its_text():
-    damaged = replace(TURN, details=CauseDetails(), text="as it was said")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "microscope",
+        "plate_scale",
+        "plate_strain",
+        "plate_shape",
+        "slip",
+        "off_sites",
+        "roughness",
+    ],
+)
+def test_a_cause_of_a_file_without_its_data_is_its_text(name):
+    damaged = replace(
+        TURN, name=name, unit="m", details=CauseDetails(), text="as it was said"
+    )
     assert what_it_is(damaged) == "as it was said"
 
 
