@@ -454,8 +454,7 @@ def without_turning(
     if dof <= 0 or np.count_nonzero(np.diff(key)) + 1 < 2 * len(means.key):
         return means
     about = _about_means(key, values)
-    order = np.linspace(-1, 1, len(key))
-    slow = np.polynomial.legendre.legvander(order, TURNS)[:, 1:].T
+    slow = _of_order(len(key), TURNS)
     slow_about = _about_means(key, slow)
     size = np.linalg.lstsq(slow_about.T, about[0], rcond=None)[0]
     left = float(((about[0] - size @ slow_about) ** 2).sum())
@@ -501,14 +500,17 @@ def repeat_motion(
     if free <= 0:
         return None
     about = np.concatenate([_about_means(key, place), _about_means(key, offset)])
-    slow = _about_means(
-        key,
-        np.polynomial.legendre.legvander(np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T,
-    )
+    slow = _about_means(key, _of_order(len(key), SLOW))
     trend = np.linalg.lstsq(slow @ slow.T, slow @ about.T, rcond=None)[0]
     change = np.diff(about - trend.T @ slow)
     # neighbours share a reading
     return RepeatMotion(change @ change.T / 2, 2 * free // 3)
+
+
+def _of_order(n: int, degree: int) -> np.ndarray:
+    """Return polynomials of the order of n readings, without the constant, (degree, n)."""
+    order = np.linspace(-1, 1, n)
+    return np.polynomial.legendre.legvander(order, degree)[:, 1:].T
 
 
 def _about_means(key: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -786,7 +786,7 @@ def _budget(
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
     of_plate, of_lines = plate.result.artifact_map, solved.lines
     yield from _sources(
-        ("xy", "m"),
+        "xy",
         solved.variances,
         np.stack([of_plate.u_ax, of_plate.u_ay]),
         result,
@@ -798,23 +798,21 @@ def _budget(
             for name, cover in of_lines.covariances(0.0).items()
             if name != TEMPERATURE  # which turns no line
         }
-        yield from _sources(
-            ("theta", "rad"), variances, of_plate.u_a_theta, result, plate
-        )
+        yield from _sources("theta", variances, of_plate.u_a_theta, result, plate)
     yield from (
         line for line in budget_lines(result) if line.component == INTERPOLATION
     )
 
 
 def _sources(
-    quantity_and_unit: tuple[str, str],
+    quantity: str,
     variances: dict[str, np.ndarray],
     u_of_plate: np.ndarray,
     result: CalibrationResult,
     plate: KnownPlate,
 ) -> Iterator[BudgetLine]:
     """Yield a line of the budget for each source of the variances of a map."""
-    quantity, unit = quantity_and_unit
+    unit = {"xy": "m", "theta": "rad"}[quantity]
     noise, inf = result.noise, float("inf")
     sigma = getattr(noise, f"sigma_{quantity}")
     by = next(
