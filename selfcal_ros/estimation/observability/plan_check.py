@@ -160,8 +160,8 @@ def check_plan(plan: Plan) -> PlanCheck:
         observability,
         unknown_sites=int((~system.known_sites).sum()),
         harmonics_untested=system.angular.harmonics_untested,
-        nodes_untested=system.nodes_untested
-        and all(view.repeats == 1 for view in plan.views if view.grid),
+        nodes_untested=all(view.repeats == 1 for view in plan.views if view.grid)
+        and system.nodes_untested,
     )
 
 

@@ -204,7 +204,7 @@ def _failed_tests(
         failed.append(NotConverged())
     if solved.model is not None:
         system = solved.model.problem.system
-        if system.nodes_untested and not _test_the_model(solved.xy):
+        if not _test_the_model(solved.xy) and system.nodes_untested:
             failed.append(RoughnessUntested())
         if system.angular.harmonics_untested:
             failed.append(HarmonicsUntested())
