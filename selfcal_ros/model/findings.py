@@ -96,10 +96,10 @@ class CauseDetails:
     def to_dict(self) -> dict[str, Any]:
         """Return what there is, by name."""
         return {
-            name: value
-            for name, value in vars(self).items()
-            if not (isinstance(value, float) and math.isnan(value))
-            and (isinstance(value, float) or value)
+            item.name: value
+            for item in fields(self)
+            if (value := getattr(self, item.name)) == value  # no NaN
+            and value != item.default
         }
 
 
@@ -680,11 +680,12 @@ def finding_to_dict(finding: Finding | Cause) -> dict[str, Any]:
     data |= {
         "name": finding.name,
         "mark": list(finding.mark),
-        "details": finding.details,
+        "details": finding.details.to_dict()
+        if isinstance(finding, Cause)
+        else finding.details,
     }
     if isinstance(finding, Cause):
         data |= {
-            "details": finding.details.to_dict(),
             "effect_rms": finding.effect_rms,
             "effect_max": finding.effect_max,
             "told": finding.told,

@@ -22,6 +22,7 @@ removes in part. Before a view is split, its slip therefore competes with every 
 does not hold.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 
@@ -624,17 +625,15 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             }
             index = of_views.index[at[0]]
             mark = problem.system.grid.views.mark_at(*at[1:]) if grid else at[1:]
+            residual = float(abs(readings.residual[at]))
             outliers[index, readings.kind, mark] = Removed(
                 view=measurements.views[index].view.name,
                 kind=readings.kind,
                 mark=mark,
                 standardised=float(np.sqrt(ratio[at])),
                 leverage=float(1 - readings.redundancy[at]),
-                **{
-                    "residual_m" if grid else "residual_rad": float(
-                        abs(readings.residual[at])
-                    )
-                },
+                residual_m=residual if grid else math.nan,
+                residual_rad=math.nan if grid else residual,
             )
     return outliers
 
