@@ -10,9 +10,10 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import reversal
-from selfcal_ros.estimation.verdict.reversal import reversal_of
+from selfcal_ros.estimation.verdict.reversal import Reversal, reversal_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.lattice_plans import plan_of
@@ -98,6 +99,28 @@ def test_a_constant_reversal_differs_nowhere():
         assert reversal_of(fit_joint(readings, Options())) is None
         causes = calibrate(readings, Options()).verdict.causes
         assert "reversal" not in [cause.name for cause in causes]
+
+
+def test_what_is_the_same_everywhere_is_no_part_of_it():
+    """Also where the model has no approach that takes it: 40 nm, and noise, of 100 nm inside."""
+    bare = Options(terms=(ModelTerm("approach", 0.0),))
+    _, readings = measured(1, constant)
+    assert reversal_of(fit_joint(readings, bare)) is None
+    _, readings = measured(1, rising)
+    found = reversal_of(fit_joint(readings, bare))
+    assert 30e-9 < found.size_m[0] < 75e-9 and found.size_m[1] == 0
+
+
+def test_the_datum_takes_the_mean_of_its_effect_off_every_node():
+    _, readings = measured(1, rising)
+    result = calibrate(readings, Options())
+    at_edges = np.zeros((2, 7, 7))
+    at_edges[0, 0], at_edges[0, -1] = -1.0, 1.0
+    found = Reversal(1e-9, np.array([70e-9, 0.0]), np.zeros(2), at_edges)
+    on_x, on_y = np.abs(found.effect(result).xy)
+    assert on_x[3, 3] == pytest.approx(20e-9)  # two of seven columns
+    assert on_x[0, 3] == pytest.approx(np.hypot(70e-9, 20e-9))
+    assert not on_y.any()
 
 
 def test_it_is_found_by_chance_as_often_as_its_level_says(monkeypatch):
