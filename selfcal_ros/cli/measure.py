@@ -19,8 +19,9 @@ from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.outputs import can_print_symbols, to_ascii
 from selfcal_ros.portable import ended_by_signals, say_no_more
+from selfcal_ros.reporting.summary.numbers import um
 from selfcal_ros.settings.estimator import read_plan
-from selfcal_ros.units import MM_PER_M, NM_PER_M
+from selfcal_ros.units import MM_PER_M
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -212,5 +213,5 @@ def progress_line(progress: ViewProgress) -> str:
             f"{rejected} rejected ({', '.join(f'{name} {n}' for name, n in reasons)})"
         )
     if math.isfinite(readings.sigma_xy):
-        parts.append(f"noise {readings.sigma_xy * NM_PER_M:.3g} nm")
+        parts.append(f"noise {um(readings.sigma_xy)}")
     return f"  {100 * progress.coverage:3.0f} %  " + ", ".join(parts)

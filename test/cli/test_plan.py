@@ -298,7 +298,7 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     larger = found["U_xy_if_larger"]
     assert 2 * found["U_xy"] < larger < 3 * found["U_xy"]
     assert (
-        f"from noise alone 35.6 nm; {larger * 1e9:.3g} nm if all that is assumed"
+        f"from noise alone 0.0356 µm; {larger * 1e6:.3g} µm if all that is assumed"
         in text
     )
     assert main([*asked, "--model", "none", "--json"]) == 0

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import printable
-from selfcal_ros.reporting.summary.numbers import arcsec, significant
-from selfcal_ros.units import NM_PER_M
+from selfcal_ros.reporting.summary.numbers import arcsec, um
 
 
 def progress_line(command: Command, view: ViewProgress | None) -> str:
@@ -56,7 +55,7 @@ def _phrases(view: ViewProgress) -> list[str]:
         )
 
     if math.isfinite(readings.sigma_xy):
-        parts.append(f"σ {significant(readings.sigma_xy * NM_PER_M, 2)} nm")
+        parts.append(f"σ {um(readings.sigma_xy)}")
     elif math.isfinite(readings.sigma_theta):
         parts.append(f"σ {arcsec(readings.sigma_theta)}")
     return parts

@@ -14,10 +14,11 @@ from selfcal_ros.model.findings import Finding, RestNotIdentified
 from selfcal_ros.model.parts import HeldOutFigures
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.view import Plan
+from selfcal_ros.reporting.summary.numbers import arcsec, um
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
 from selfcal_ros.reporting.words.observability import describe_view
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
-from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 
 def why_text(why: Finding | None, artifact: Artifact) -> str:
@@ -135,33 +136,32 @@ _CERTIFICATES: dict[str, str] = {
     "yaw": "declare a smaller yaw:SIZE, from a measurement of the stage's angles",
 }
 """What removes a line of a plan's budget that no change of the plan removes."""
+_SIZES = {"xy": um, "theta": arcsec}
+"""How sizes of a quantity are written, as in results."""
 
 
 def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
     """Return the predicted budget of a plan as a table, with what removes each line."""
     out = ["predicted uncertainty budget (standard uncertainty, rms):"]
-    for quantity, name, factor, unit in (
-        ("xy", "XY, one coordinate", NM_PER_M, "nm"),
-        ("theta", "theta", URAD_PER_RAD, "µrad"),
-    ):
+    for quantity, name in (("xy", "XY, one coordinate"), ("theta", "theta")):
+        size = _SIZES[quantity]
         lines = [line for line in budget.lines if line.quantity == quantity]
         for line in lines:
             removal = budget.removals.get((quantity, line.component))
             out.append(
                 f"  {name if line is lines[0] else '':20}{line.component:18}"
-                f"{line.effect_rms * factor:9.3g} {unit}{100 * budget.share(line):5.0f} %"
+                f"{size(line.effect_rms):>13}{100 * budget.share(line):5.0f} %"
                 + ("" if removal is None else f"  {removal_text(removal, line, plan)}")
             )
         if lines:
             expanded, noise = (
-                2 * factor * budget.u_rms(quantity, noise_only=only)
+                size(2 * budget.u_rms(quantity, noise_only=only))
                 for only in (False, True)
             )
-            larger = 2 * factor * budget.u_rms(quantity, if_larger=True)
+            larger = size(2 * budget.u_rms(quantity, if_larger=True))
             out.append(
-                f"  {'':20}U (k = 2) {expanded:17.3g} {unit}; from noise alone {noise:.3g} "
-                f"{unit}; {larger:.3g} {unit} if all that is assumed were {TIMES} times "
-                "as large"
+                f"  {'':20}{'U (k = 2)':18}{expanded:>13}; from noise alone {noise}; {larger} "
+                f"if all that is assumed were {TIMES} times as large"
             )
     return out
 
@@ -172,8 +172,8 @@ def removal_text(removal: Removal, line: BudgetLine, plan: Plan) -> str:
         return _CERTIFICATES.get(
             line.component, f"declare a smaller {line.component}:SIZE"
         )
-    factor, unit = (NM_PER_M, "nm") if line.quantity == "xy" else (URAD_PER_RAD, "µrad")
-    return f"{step_text(removal.step, plan)}: {removal.effect_rms * factor:.3g} {unit}"
+    left = _SIZES[line.quantity](removal.effect_rms)
+    return f"{step_text(removal.step, plan)}: {left}"
 
 
 def step_text(step: plan_check.Step, plan: Plan) -> str:

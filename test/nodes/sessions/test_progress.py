@@ -31,7 +31,7 @@ PROGRESS = ViewProgress(1, VIEW, 121, 83, 24, 12, READ, 9)
 def test_a_view_that_is_measured_word_for_word():
     assert progress_line(COMMAND, PROGRESS) == (
         "view 2 of 4 'rot90': 83 of 121 marks, 12 of 24 lines, 3 rejected (stage_moving 2, "
-        "low_score 1), σ 19 nm"
+        "low_score 1), σ 0.0192 µm"
     )
 
 
