@@ -148,12 +148,12 @@ class Run:
         Parameters
         ----------
         resume : bool
-            Continue the bag of an interrupted run, if there is one.
+            Continue the bag of an interrupted run.
 
         Raises
         ------
         InputError
-            If the bag exists, or is not of this plan.
+            If the bag exists or, to be continued, does not, or is not of this plan.
         MachineError
             If the machine does not do as commanded; it was stopped, the bag is kept.
         NoDataError
@@ -174,8 +174,8 @@ class Run:
 
     def _begin(self, resume: bool) -> list[Command]:
         """Open the bag; return the commands to begin with."""
-        if resume and self.bag.is_dir():
-            remove_unbegun(self.bag)
+        if resume:
+            self._require_begun()
         if not self.bag.exists():
             self._journal = create(self.bag)
             self._declare()
@@ -187,6 +187,19 @@ class Run:
                 "continue it with --resume, remove it, or name another folder",
             )
         return self._take_up()
+
+    def _require_begun(self) -> None:
+        """Refuse a bag that is not there; remove one that was killed before its first file."""
+        if not self.bag.exists():
+            raise InputError(
+                str(self.bag),
+                "no such folder, there is nothing to continue",
+                "name the bag of the interrupted run, or leave out --resume to begin",
+            )
+        if self.bag.is_dir():
+            remove_unbegun(self.bag)
+        if not self.bag.exists():
+            self.desk.say(f"{self.bag}: nothing was saved yet, the measurement begins")
 
     def _declare(self) -> None:
         assert self._journal is not None

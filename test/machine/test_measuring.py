@@ -266,6 +266,18 @@ def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
         )
 
 
+def test_what_is_not_there_is_not_continued(tmp_path):
+    """A slip in the name of the bag would measure all views again."""
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(InputError, match="nothing to continue; name the bag"):
+        run_of(tmp_path, machine, cell).measure(resume=True)
+    assert not (tmp_path / "bag").exists()
+    (tmp_path / "bag").mkdir()  # killed before its first file was whole
+    desk = Agreeing()
+    run_of(tmp_path, machine, cell, desk=desk).measure(resume=True)
+    assert "nothing was saved yet, the measurement begins" in desk.lines[0]
+
+
 def test_a_renamed_bag_is_not_begun_anew(tmp_path):
     """The readings of its files of the former name would be left out."""
     cell, machine = write_cell(tmp_path)

@@ -94,7 +94,10 @@ def prepare(folder: Path, marks: int = 5) -> None:
 
 
 def measured(folder: Path, cut: Cut | None = None) -> Ended:
-    """Run ``selfcal measure --resume`` in a process of its own, killed at a cut."""
+    """Run ``selfcal measure`` in a process of its own, killed at a cut.
+
+    An interrupted run is resumed.
+    """
     process = PROCESSES.Process(target=main, args=(folder, cut))
     process.start()
     process.join()
@@ -206,8 +209,9 @@ def main(folder: Path, cut: Cut | None) -> None:
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
+        resume = ["--resume"] if Path("bag").exists() else []
         code = selfcal(
-            ["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]
+            ["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", *resume]
         )
         Path("passages.json").write_text(json.dumps(passed))
     raise SystemExit(code)
