@@ -181,6 +181,8 @@ def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
         )
     ]
     assert first == [pytest.approx(-20 / 25.4), -20]
+    assert "# unit of the positions: in; " in Path("inch.txt").read_text()
+    assert "# unit of the positions: mm; " in Path("mm.txt").read_text()
 
 
 def test_onto_combines_with_the_active_table(capsys):

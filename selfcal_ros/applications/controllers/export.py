@@ -67,7 +67,7 @@ class Format:
     parts : tuple of str
         What is added to the name of each file.
     notes : tuple of str
-        What the format cannot say, and what the machine needs.
+        What the format cannot say, and what the machine needs; {unit} is that of the positions.
     steps : tuple of str
         How the files are put into use, step by step, and how they are seen to act; {files}, {x}
         and {y} are their names and axes.
@@ -93,7 +93,10 @@ FORMATS = {
         comment="# ",
         unit="in",
         comments_last=True,
-        notes=("positions in the unit of KMotion's coordinates, which is the inch",),
+        notes=(
+            "unit of the positions: {unit}; it has to be that of KMotion's coordinates (in its "
+            "source: in)",
+        ),
         steps=(
             "KMotionCNC, Tool Setup, Trajectory Planner: enter {files} as Geometric Correction",
             "set Collinear Tolerance there: arcs are split into lines that differ by at most it",
@@ -248,7 +251,7 @@ def export(
     comments = [
         form.what,
         *provenance(result, frame, filled=filled, command=command),
-        *form.notes,
+        *(note.format(unit=frame.unit) for note in form.notes),
         *(IMPLIED if form.sign_is_implied else ()),
         _remaining_text(residuals[0]),
     ]
