@@ -334,12 +334,12 @@ MISTAKES = [
         ("cal check no.cal", 2, "no.cal: no such file"),
         ("gcode part.nc R.json -o o.nc", 2, "dialect"),
         ("certificate R.json no.yaml -o c.xml", 2, "no.yaml: no such file"),
-        ("detect bags/camera -o marks", 2, "pixel_size and mark_size"),
+        ("detect bags/camera -o marks", 2, "--pixel-size and --mark-size"),
         ("detect bags/demo -o marks --pixel-size 6e-6 --mark-size 72e-6", 4, "image"),
         (
             "detect bags/camera -o marks --pixel-size 6 --mark-size 72",
             2,
-            "pixel_size|mark_size",
+            "--pixel-size: 6.0 is outside 0.0 to 1.0 m",
         ),
         (
             "camera init bags/demo -o n.yaml --mark-size 72e-6 --mark-pixels 12",

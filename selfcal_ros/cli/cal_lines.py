@@ -244,8 +244,8 @@ def add_line_tables(group: argparse._SubParsersAction) -> None:
     square = group.add_parser(
         "orthogonality",
         help="the two-point table for axes that are not perpendicular",
-        description="From a precision square: --measured, --over, --travel (lengths such as 5um; "
-        "write a negative one as --measured=-5um). Or from a calibration: RESULT.json. "
+        description="From a precision square: --measured, --over, --travel (lengths such as 5um). "
+        "Or from a calibration: RESULT.json. "
         "The y axis is corrected from the position of the x axis; --along y exchanges "
         "them.",
     )

@@ -24,6 +24,7 @@ from selfcal_ros.outputs import write_bytes
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.parameter import TYPED
 from selfcal_ros.vision.detector import Judged
 from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         max_marks=ANY_NUMBER,
     )
     draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
-    detector = ImageDetector(settings, args.params or "options", draw)
+    detector = ImageDetector(settings, args.params or TYPED, draw)
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)
     else:

@@ -42,6 +42,8 @@ from selfcal_ros.portable import say_no_more
 from selfcal_ros.start import hold_interrupts
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
+NEGATIVE = re.compile(r"-\.?\d")
+"""Begins a negative value, with or without a unit: no option of a verb does."""
 NUMBERS = {
     "float": "a number; give it{unit} without a unit, with a decimal point",
     "int": "a whole number",
@@ -255,6 +257,8 @@ class Parser(argparse.ArgumentParser):
         # float() reads 1_0 as 10, and other digits
         self.register("type", float, number_of)
         self.register("type", int, whole_number_of)
+        # argparse takes -20e-6 and -5um for options
+        self._negative_number_matcher = NEGATIVE
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print help or version; argparse passes over a disk that is full."""

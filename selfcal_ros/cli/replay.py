@@ -42,6 +42,7 @@ from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.nodes import CollectorSettings
+from selfcal_ros.settings.parameter import TYPED
 from selfcal_ros.topics import INPUT_TOPICS, LARGEST_DOMAIN
 
 NODES = ("measurement_collector", "pose_sequencer", "solver")
@@ -229,7 +230,7 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
 
     settings = node_settings(args.params, DetectorSettings, **options)
     MarkDetector(
-        settings, f"{args.bag} has images and no detections: {args.params or 'options'}"
+        settings, f"{args.bag} has images and no detections: {args.params or TYPED}"
     )
     # how images reach it is not the user's here
     way = DetectorSettings(transport=transport)

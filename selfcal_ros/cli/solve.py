@@ -44,7 +44,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
-from selfcal_ros.model.terms import microscope_term
+from selfcal_ros.model.terms import microscope_term, parse_terms
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.findings import worded
@@ -56,7 +56,7 @@ from selfcal_ros.reporting.words.tables import (
     validation_text,
 )
 from selfcal_ros.settings.estimator import solver_options
-from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
+from selfcal_ros.settings.nodes import NO_TERMS, CollectorSettings, SolverSettings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -194,20 +194,24 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
 
 def _model(args: argparse.Namespace) -> list[str] | None:
     """Return the terms of --model and --microscope; None if neither is given."""
+    words = [word.strip() for text in args.model or () for word in text.split(",")]
+    parse_terms([word for word in words if word != NO_TERMS], "--model")
     if args.microscope is None:
         return args.model
     sizes = args.microscope.split(":")
     usual = microscope_term()
     missing = [f"{size:g}" for size in usual.parts[len(sizes) :]]
     if len(sizes) > len(usual.parts) or any(
-        usual.name in text or text == "none" for text in args.model or ()
+        usual.name in text or text == NO_TERMS for text in args.model or ()
     ):
         raise InputError(
             "--microscope",
             f"'{args.microscope}' does not fit",
             "give up to three sizes, and no microscope or none in --model",
         )
-    return [*(args.model or ()), ":".join([usual.name, *sizes, *missing])]
+    term = ":".join([usual.name, *sizes, *missing])
+    parse_terms([term], "--microscope")
+    return [*(args.model or ()), term]
 
 
 def _reference(text: str | None) -> dict[str, Any]:

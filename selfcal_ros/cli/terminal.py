@@ -15,7 +15,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
 from selfcal_ros.settings.nodes import overrides_in
-from selfcal_ros.settings.parameter import Settings
+from selfcal_ros.settings.parameter import TYPED, Settings
 
 STDOUT = "-"
 """Name of an output file: the result goes to stdout, everything else to stderr."""
@@ -89,10 +89,11 @@ def add_parameters(
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
     """Return the settings of a node from a parameter file, if any, and arguments, which win."""
-    where = params or "options"
-    overrides = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
-    overrides |= {name: value for name, value in given.items() if value is not None}
-    return kind.checked(overrides, where)
+    where = params or TYPED
+    of_file = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
+    kind.checked(of_file, where)
+    typed = {name: value for name, value in given.items() if value is not None}
+    return kind.checked(of_file | typed, TYPED)
 
 
 def given(args: argparse.Namespace, options: Mapping[str, str]) -> dict[str, Any]:

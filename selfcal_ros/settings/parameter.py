@@ -14,8 +14,30 @@ from selfcal_ros.errors import InputError, known_are, mend_of
 BARE_Y = "y"
 """ROS reads a bare y in a parameter file as true, and `ros2 param dump` writes it bare."""
 
+TYPED = "--"
+"""Place of values that were typed as options of a command: what begins these."""
+_OPTION_OF = {
+    "measurement_sense": "sense",
+    "misalignment_model": "misalignment",
+    "model_terms": "model",
+    "reference_certificate": "certificate",
+    "reference_error": "reference",
+    "reference_kind": "reference",
+    "reference_marks": "reference",
+    "reference_u": "reference",
+}
+"""Parameter -> the option that sets it, where that has another name."""
+
 ROS_OWN = ("use_sim_time", "start_type_description_service")
 """Parameters that every node of rclpy has."""
+
+
+def place_of(where: str, *names: str) -> str:
+    """Return the place of parameters for messages: their options if typed, else their keys."""
+    if not where.endswith(TYPED):
+        return f"{where}: {' and '.join(names)}"
+    options = (_OPTION_OF.get(name, name).replace("_", "-") for name in names)
+    return where + f" and {TYPED}".join(options)
 
 
 @dataclass(frozen=True)
@@ -33,6 +55,7 @@ class Parameter:
     def check(self, value: Any, where: str) -> Any:
         """Return `value` as the parameter's type, or raise InputError."""
         kind = type(self.default)
+        place = place_of(where, self.name)
         if value is True and self.default == BARE_Y:
             value = BARE_Y
         if kind is list and isinstance(value, str | tuple):
@@ -41,19 +64,19 @@ class Parameter:
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(
-                f"{where}: {self.name}",
+                place,
                 f"{value!r} is not of type {kind.__name__}",
                 "put it in quotes" if kind is str else mend_of(value, kind),
             )
         if kind is list and not all(isinstance(item, str) for item in value):
             raise InputError(
-                f"{where}: {self.name}",
+                place,
                 f"{value!r} is not a list of strings",
                 "put each item in quotes",
             )
         if self.choices and value not in self.choices:
             raise InputError(
-                f"{where}: {self.name}",
+                place,
                 f"{value!r} is not known",
                 f"choose one of {', '.join(self.choices)}",
             )
@@ -62,7 +85,7 @@ class Parameter:
             and (self.high is None or value <= self.high)
         ):
             raise InputError(
-                f"{where}: {self.name}",
+                place,
                 (
                     f"{value} is below {self.low} {self.unit}"
                     if self.high is None

@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.edge_markers import CORNERS, DICTIONARY, SIDE, edge_markers
+from selfcal_ros.settings.parameter import place_of
 from selfcal_ros.vision.detector import Mark, MarkFault
 from selfcal_ros.vision.images import Picture
 
@@ -38,7 +39,7 @@ class CodedPlate:
         match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
         if not match:
             raise InputError(
-                f"{where}: aruco",
+                place_of(where, "aruco"),
                 f"'{text}' is not the marks along x and y",
                 "write for example 11x9",
             )
@@ -46,7 +47,7 @@ class CodedPlate:
             import cv2  # extra camera
         except ModuleNotFoundError as error:
             raise InputError(
-                f"{where}: aruco",
+                place_of(where, "aruco"),
                 "OpenCV, which reads the markers, is not installed",
                 "pip install 'selfcal_ros[camera]', or leave aruco out",
             ) from error

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.errors import InputError
 from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.parameter import place_of
 from selfcal_ros.vision.finding import Candidate, candidates
 from selfcal_ros.vision.fitting import Fit, Windows, fit_marks, lie_inside, windows_of
 from selfcal_ros.vision.images import Picture
@@ -108,7 +109,7 @@ class MarkDetector:
         if unset:
             verb, them = ("are", "them") if len(unset) > 1 else ("is", "it")
             raise InputError(
-                f"{where}: {' and '.join(unset)}",
+                place_of(where, *unset),
                 f"{verb} not set",
                 f"give {them} in m; `selfcal camera init` finds the size of a pixel",
             )
@@ -117,15 +118,15 @@ class MarkDetector:
         self._width = settings.mark_width / settings.pixel_size or WIDTH * self.size
         if not SMALLEST_SIZE <= self.size <= LARGEST_SIZE:
             raise InputError(
-                f"{where}: mark_size",
+                place_of(where, "mark_size"),
                 f"{self.size:.3g} pixels",
-                f"a mark has {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} pixels; correct "
-                "mark_size or pixel_size",
+                f"a mark has {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} pixels; correct it "
+                "or the size of a pixel",
             )
         if 2 * self._width >= self.size and settings.mark in ("ring", "cross"):
             raise InputError(
-                f"{where}: mark_width",
-                "at least half of mark_size",
+                place_of(where, "mark_width"),
+                "at least half of the size of a mark",
                 "give the width of one line",
             )
         self._sign = (

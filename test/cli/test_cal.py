@@ -601,7 +601,8 @@ def test_the_example_of_the_source(run):
     ]
     code, out, _ = run(
         "orthogonality",
-        "--measured=-5um",
+        "--measured",
+        "-5um",
         "--over",
         "200mm",
         "--travel",

@@ -212,12 +212,18 @@ def test_bad_images_give_one_line_each_and_lose_nothing_else(bag, tmp_path, caps
 @pytest.mark.parametrize(
     "arguments, code, line",
     [
-        (["--pixel-size", "0"], 2, "pixel_size: is not set; give it in m"),
+        (["--pixel-size", "0"], 2, "--pixel-size: is not set; give it in m"),
         (
             ["--mark-size", "2e-6"],
             2,
-            "mark_size: 0.667 pixels; a mark has 6 to 2000 pixels",
+            "--mark-size: 0.667 pixels; a mark has 6 to 2000 pixels",
         ),
+        (
+            ["--mark-size", "-20e-6"],
+            2,
+            "--mark-size: -2e-05 is outside 0.0 to 1000.0 m",
+        ),
+        (["--aruco", "9"], 2, "--aruco: '9' is not the marks along x and y"),
         (["--namespace", "other"], 4, "no topic stage/image or stage/image/compressed"),
     ],
 )

@@ -462,6 +462,20 @@ def test_parameter_files_that_cannot_be_read(tmp_path, capsys, bag):
 
 
 @pytest.mark.parametrize(
+    "options, said",
+    [
+        (("--reference", "artifact:2:0"), "--reference: 2.0 is outside -0.09 to 0.09"),
+        (("--model", "drift:-1"), "--model: drift: the size '-1' is not a positive"),
+        (("--microscope", "0.01:5"), "--microscope: microscope: the size 5 is outside"),
+    ],
+)
+def test_a_wrong_value_is_named_by_its_option(tmp_path, capsys, bag, options, said):
+    path = params(tmp_path, solver={"method": "joint"})
+    for more in ((), ("--params", path)):
+        assert refused(capsys, 2, bag, *options, *more).startswith(said)
+
+
+@pytest.mark.parametrize(
     "options",
     [
         ("--method", "best"),

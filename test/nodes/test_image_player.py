@@ -290,16 +290,16 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
     [
         (
             [],
-            "has images and no detections: options: pixel_size and mark_size: are not "
+            "has images and no detections: --pixel-size and --mark-size: are not "
             "set; give them in m; `selfcal camera init` finds the size of a pixel",
         ),
         (
             ["--pixel-size", "6e-6"],
-            "has images and no detections: options: mark_size: is not set; give it in m",
+            "has images and no detections: --mark-size: is not set; give it in m",
         ),
         (
             ["--pixel-size", "6e-6", "--mark-size", "7.2e-6"],
-            "options: mark_size: 1.2 pixels; a mark has 6 to 2000 pixels",
+            "--mark-size: 1.2 pixels; a mark has 6 to 2000 pixels",
         ),
     ],
 )
