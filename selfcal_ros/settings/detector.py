@@ -87,7 +87,8 @@ class DetectorSettings(ManagedSettings):
     )
     max_blur: float = declared(
         0.15,
-        "blur of a mark, over its size, above which it is rejected as defocused",
+        "blur of a mark, over its size or over 10 px, whichever is larger, above which it is "
+        "rejected as defocused",
         "",
         0.0,
         1.0,

@@ -29,6 +29,9 @@ SATURATED = 0.01
 """Part of saturated pixels from which a mark is rejected."""
 SAME = 0.3
 """Distance of two fits, in sizes of the mark, below which they are of the same mark."""
+SMALL = 10.0
+"""Size of a mark, px, below which lens and pixels, not the focus, make its blur over its size:
+marks of 6 to 10 px that are blurred by 1 to 1.5 px lie where their u says."""
 FIRST_BLUR = 0.05
 """First blur of a fit, in sizes of the mark; at least a pixel."""
 
@@ -263,7 +266,7 @@ class MarkDetector:
         size = fit.shape.get("size", self.size)
         if self._sign * fit.contrast < 0:
             return MarkFault.NO_FIT
-        if abs(fit.shape["blur"]) > settings.max_blur * self.size:
+        if abs(fit.shape["blur"]) > settings.max_blur * max(self.size, SMALL):
             return MarkFault.DEFOCUSED
         if fit.bright + fit.dark + fit.inner_stains + fit.outer_stains >= STAINED:
             # these spoil the levels of the others
