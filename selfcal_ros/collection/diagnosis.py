@@ -49,13 +49,9 @@ UNSTAMPED = (
     "use_sim_time that hears no /clock stamps 0 too"
 )
 Span = tuple[int, int] | None
-NEARLY_ALL = 0.9
-"""Fraction of the marks at whose sites the stage stands if their stamps alone are wrong."""
 STOPPED = 20
 """Number of the last marks of a view at all of which a stage that no longer moves is indicated at
 one place."""
-LATE = 50
-"""Largest number of detections between which stamps of the wrong time are recognised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +80,8 @@ class Evidence:
         Pose of the plate, or what the ids are, and remedy, if the marks are not seen as planned.
     joints : bool
         Whether the joints may be wrong: no view is seen as planned.
+    late : str
+        When the stage rests at the marks, and remedy, if not at the stamps of the detections.
     """
 
     rejected: Mapping[str, int]
@@ -101,6 +99,7 @@ class Evidence:
     sense: Sense = Sense.MICROSCOPE_MOVES
     lies: str = ""
     joints: bool = True
+    late: str = ""
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,9 @@ def main_reason(
 
 def diagnose(evidence: Evidence) -> RejectionFinding | None:
     """Return why most of the detections were rejected; None if no reason dominates."""
-    main = main_reason(evidence.rejected, evidence.used, placed=bool(evidence.lies))
+    main = main_reason(
+        evidence.rejected, evidence.used, placed=bool(evidence.lies or evidence.late)
+    )
     if main is None:
         return None
     reason, count, total = main
@@ -240,7 +241,7 @@ def _seconds(offset_s: float) -> str:
 
 def _stage(e: Evidence) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
-    elsewhen = _at_another_time(e) or _encoder_stopped(e)
+    elsewhen = _encoder_stopped(e) or e.late
     if elsewhen:
         return elsewhen
     joints = wrong_joints(e) if e.joints else None
@@ -263,29 +264,6 @@ def _stage(e: Evidence) -> str | None:
         f"the stage stands {away:.3g} m from the sites of the detected marks (median); "
         f"check {check}the ids of the marks and how the plate lies"
     )
-
-
-def _at_another_time(e: Evidence) -> str | None:
-    """Return that the stage was at the marks some detections before or after their stamps."""
-    if not _away(e, lambda stage: stage) > e.limit_m:
-        return None
-    placed = [(view.stage, view.sites - view.cells) for view in e.marks]
-    half = sum(len(stage) for stage, _ in placed) / 2
-    for steps, late in product(range(1, LATE + 1), (True, False)):
-        at, of = (slice(None, -steps), slice(steps, None))[:: 1 if late else -1]
-        distance = np.concatenate(
-            [np.abs(stage[at] - axis[of]) for stage, axis in placed]
-        )
-        if len(distance) < half:
-            break
-        if np.quantile(distance, NEARLY_ALL) * e.pitch_m <= e.limit_m:
-            detections = "1 detection" if steps == 1 else f"{steps} detections"
-            return (
-                f"at the stamp of a mark the stage stands where the mark {detections} "
-                f"{'later' if late else 'earlier'} is seen; stamp detections and encoder "
-                "samples with the time of the exposure, by one clock"
-            )
-    return None
 
 
 def _encoder_stopped(e: Evidence) -> str | None:

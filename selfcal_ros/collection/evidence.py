@@ -3,7 +3,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,14 +15,17 @@ from selfcal_ros.collection.diagnosis import (
     RejectionFinding,
     Span,
     diagnose,
+    main_reason,
     wrong_joints,
 )
 from selfcal_ros.collection.expected import mark_rows
 from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import REMEDY, Kind, Reason
+from selfcal_ros.collection.lateness import Lag, lag_of
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.marks.seen_poses import (
     NamedMarks,
+    SeenPose,
     mirrored_alike,
     seen_poses,
     texts,
@@ -38,6 +41,8 @@ A_ROW = 0.25
 """Detections of a row of the plate, as a part of those of the row with most of them."""
 LOOKED_AT = 2000
 """Number of the last detections of a view whose stage positions are examined."""
+RESTS_LOOKED_AT = 100
+"""The same for when the stage rests at their marks."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +108,14 @@ class DetectionsSeen:
         self, index: int, readings: ViewReadings, rejected: Mapping[str, int]
     ) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""
-        marks = self._named({index: readings}) if rejected.keys() & set(PLACED) else {}
+        marks, late = {}, ""
+        if rejected.keys() & set(PLACED):
+            marks = self._named({index: readings})
+            late = str(self._lag({index: readings}) or "")
         return diagnose(
-            self._evidence(rejected, 0, marks, joints=False, lies="", view=index)
+            self._evidence(
+                rejected, 0, marks, joints=False, lies="", late=late, view=index
+            )
         )
 
     def findings(
@@ -131,6 +141,12 @@ class DetectionsSeen:
         if size is not None:
             return {None: size}
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
+        of_views = [(view.rejected, view.used) for view in views.values()]
+        most = any(
+            main_reason(*counts, placed=True)
+            for counts in ((rejected, used), *of_views)
+        )
+        lag = self._lag(views) if most else None
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
         joints = not any(pose.planned for pose in poses.values())
@@ -143,6 +159,8 @@ class DetectionsSeen:
         session_evidence = self._evidence(
             rejected, used, marks, joints=joints, lies=alike
         )
+        late = self._late(lag, poses, session_evidence)
+        session_evidence = replace(session_evidence, late=late)
         finding = diagnose(session_evidence)
         finding_of_view: dict[int | None, RejectionFinding | None] = {
             index: diagnose(
@@ -152,6 +170,7 @@ class DetectionsSeen:
                     {i: marks[i] for i in marks if i == index},
                     joints=joints and not faults,
                     lies=faults.get(index, ""),
+                    late=late,
                     view=index,
                 )
             )
@@ -163,7 +182,7 @@ class DetectionsSeen:
             if view_finding is not None
         }
         if finding is None or (
-            not alike
+            not (alike or late)
             and faults.keys() & named.keys()
             and not (
                 finding.reason in PLACED and joints and wrong_joints(session_evidence)
@@ -171,6 +190,42 @@ class DetectionsSeen:
         ):
             return named
         return {None: finding}
+
+    def _lag(self, views: Mapping[int, ViewReadings]) -> Lag | None:
+        """Return when the stage rests at the marks, if not at the stamps of detections."""
+        stamped = []
+        for index, readings in views.items():
+            if not readings.view.grid:
+                continue
+            table = self.table[self.view_of == index]
+            table = table[table["kind"] == Kind.GRID][-RESTS_LOOKED_AT:]
+            named = table["has_id"] & self.artifact.has(table["m"], table["n"])
+            view = readings.view
+            x, y = view.on_stage(self.artifact).site_of(
+                *self.artifact.places(
+                    *(np.where(named, table[axis], 0) for axis in "mn")
+                )
+            )
+            offset = np.stack([table["offset_x"], table["offset_y"]])
+            sites = (x + 1j * y) * self.artifact.grid_pitch_m - _complex(
+                places_of_cells(view, offset)
+            )
+            stamped.append(
+                (table["stamp"], self.sense.sign * np.where(named, sites, np.nan))
+            )
+        limit_m = self.rules.stage_limit_m(self.artifact)
+        return lag_of(stamped, self.exposures, limit_m)
+
+    def _late(
+        self, lag: Lag | None, poses: Mapping[int, SeenPose], evidence: Evidence
+    ) -> str:
+        """Return what a lag says, unless the pose of a plate or the joints explain more."""
+        wrong = [pose.explained for pose in poses.values() if not pose.planned]
+        if lag is None or lag.explained <= max(wrong, default=0.0):
+            return ""
+        if lag.varies and (wrong or (evidence.joints and wrong_joints(evidence))):
+            return ""
+        return str(lag)
 
     def _other_size(
         self, views: Mapping[int, ViewReadings], rejected: Mapping[str, int], used: int
@@ -237,6 +292,7 @@ class DetectionsSeen:
         *,
         joints: bool,
         lies: str,
+        late: str = "",
         view: int | None = None,
     ) -> Evidence:
         """Return the facts on a view, or on all."""
@@ -273,6 +329,7 @@ class DetectionsSeen:
             sense=self.sense,
             lies=lies,
             joints=joints,
+            late=late,
         )
 
     def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:

@@ -116,6 +116,35 @@ class Exposures:
                 return rows
         return np.searchsorted(instants, stamps_ns)
 
+    def rests(
+        self, stamps_ns: np.ndarray, lags_ns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where x and y stood at times before stamps, and whether at rest.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (Q,)
+            Stamps of exposures.
+        lags_ns : int64 array (L,)
+            Times before them.
+
+        Returns
+        -------
+        place : complex array (L, Q)
+            Indicated position, m; NaN without samples.
+        rests : bool array (L, Q)
+            Whether it can be used for a reading.
+        """
+        instants = (stamps_ns - lags_ns[:, None]).ravel()
+        ends = int(instants.min()), int(instants.max())
+        (x, x_codes), (y, y_codes) = (
+            track.between(*ends).query(instants)
+            for track in (self._tracks.x, self._tracks.y)
+        )
+        shape = len(lags_ns), len(stamps_ns)
+        rests = (x_codes | y_codes) == encoder.GOOD
+        return (x + 1j * y).reshape(shape), rests.reshape(shape)
+
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Take further instants of exposure, and the encoder samples since the last call.
 

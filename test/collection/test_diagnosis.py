@@ -353,26 +353,78 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     )
 
 
+REST = "the stage rests at the marks about"
+"""Beginning of what is said of detections that are stamped at another time."""
+
+
+def stamped_late(cell, late_s, *, varying=0.0, first=0):
+    """Stamp the detections from the `first` that much later, all or with some scatter."""
+    rng = np.random.default_rng(1)
+    for index, detection in enumerate(cell.detections[first:], start=first):
+        late = late_s + varying * rng.normal()
+        cell.spoil(index, stamp_ns=detection.stamp_ns + round(late * S))
+    return cell
+
+
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize(
-    ("exposures", "where"),
+    ("late_s", "said"),
     [
-        (1, "the mark 1 detection later"),
-        (3, "the mark 3 detections later"),
-        (-2, "the mark 2 detections earlier"),
+        (0.015, "stage_moving: {} 0.018 s before their"),
+        (0.03, "stage_moving: {} 0.033 s before their"),
+        (-0.03, "stage_moving: {} 0.028 s after their"),
+        (0.05, "stage_not_at_mark: {} 0.053 s before their"),
+        (0.15, "stage_not_at_mark: {} 0.15 s before their"),
+        (-0.1, "stage_not_at_mark: {} 0.098 s after their"),
     ],
 )
-def test_stamps_of_another_exposure(exposures, where, sense):
-    cell = scene(count=0, repeats=3, sense=sense)
-    step = cell.detections[1].stamp_ns - cell.detections[0].stamp_ns
-    for index, detection in enumerate(cell.detections):
-        cell.spoil(index, stamp_ns=detection.stamp_ns + exposures * step)
-    found = findings(cell.events, measurement_sense=str(sense))[None]
+def test_stamps_of_another_time(late_s, said, sense):
+    """By less than the time between two exposures, and by more."""
+    cell = scene(count=0, repeats=3, sense=sense, exposure_period_s=0.05)
+    found = findings(stamped_late(cell, late_s).events, measurement_sense=str(sense))
     assert (
-        f"stage_not_at_mark: at the stamp of a mark the stage stands where {where} is "
-        in found
+        f"were rejected as {said.format(REST)} detections are stamped;" in found[None]
     )
-    assert found.endswith("with the time of the exposure, by one clock")
+    assert "not of their arrival" in found[None] and "by one clock" in found[None]
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_stamps_that_are_late_by_times_that_vary(repeats):
+    cell = scene(plan_of("0, 90", 7, count=0, repeats=repeats), exposure_period_s=0.05)
+    found = findings(stamped_late(cell, 0.2, varying=0.03).events)
+    assert f"{REST} 0.19 s before" in found[None]
+    assert "are stamped, by times that vary; stamp detections" in found[None]
+
+
+def test_stamps_that_are_late_from_the_middle_of_a_view_on():
+    cell = scene(count=0, repeats=4, exposure_period_s=0.05)
+    found = findings(stamped_late(cell, 0.1, first=40).events)
+    assert (
+        f"58 of 100 detections were rejected as stage_not_at_mark: {REST}"
+        in found[None]
+    )
+
+
+def test_late_stamps_of_marks_without_ids():
+    """The stage moves at the stamps; which mark is which is not needed."""
+    cell = scene(count=0, with_ids=False, exposure_period_s=0.05)
+    found = findings(stamped_late(cell, 0.018).events)
+    assert f"rejected as stage_moving: {REST} 0.018 s before their" in found[None]
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_raster_seen_late_is_not_one_on_a_plate_shifted_by_a_pitch(late):
+    """All marks but those at one side look alike."""
+    cell = scene(plan_of("0, 90, tx", 13, count=0), visit_order="raster")
+    if late:
+        stamped_late(cell, 0.01)
+    else:
+        with_changed_ids(cell, lambda m, n: (m, n + 1), 1)
+        cell.detections = [d for d in cell.detections if d.n <= 6]
+    found = findings(cell.events)
+    assert list(found) == ([None] if late else [1])
+    said = REST if late else "the plate lies shifted by (+1, +0) pitches"
+    assert said in "".join(found.values())
 
 
 @pytest.mark.parametrize(

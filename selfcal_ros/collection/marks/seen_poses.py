@@ -91,12 +91,16 @@ class NamedMarks:
 
 @dataclass(frozen=True)
 class SeenPose:
-    """How a view's marks are seen: with the turn and shift found, or mirrored."""
+    """How a view's marks are seen: with the turn and shift found, or mirrored.
+
+    `explained` is the part of the marks near whose places the stage then stands.
+    """
 
     pose: Misplaced
     planned: bool
     mirrored: bool
     mirror: str = ""
+    explained: float = 1.0
 
     def text(self, other_views: str) -> str:
         """Return what is wrong, and the remedy, in one line; `other_views`: what they show."""
@@ -221,7 +225,13 @@ def _found_pose(
         found_deg=_turn(turn, pose, max_rotation_rad),
         found_shift=_shift(shift, pose),
     )
-    return SeenPose(misplaced, planned=misplaced == as_planned, mirrored=False)
+    near = np.abs(axis - (turn * view.marks + shift)) <= limit
+    return SeenPose(
+        misplaced,
+        planned=misplaced == as_planned,
+        mirrored=False,
+        explained=float(near.mean()),
+    )
 
 
 def _fitted(
