@@ -7,9 +7,13 @@ from selfcal_ros.units import NS_PER_S
 
 
 class Clock:
-    """The system's time, read once: later steps of the system's clock do not reach the stamps."""
+    """The system's time as last read: a later step of its clock does not reach the stamps."""
 
     def __init__(self) -> None:
+        self.read()
+
+    def read(self) -> None:
+        """Follow the steps that the system's clock has made."""
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
 
     def now_ns(self) -> int:
@@ -32,6 +36,9 @@ class SimulatedClock(Clock):
 
     def __init__(self, ns: int = 0) -> None:
         self.ns = ns
+
+    def read(self) -> None:
+        """Follow nothing."""
 
     def now_ns(self) -> int:
         """Return the time, ns since 1970."""

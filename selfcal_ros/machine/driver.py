@@ -119,6 +119,7 @@ class Driver:
                 self._turn.wait_for(lambda: self._jobs or self._ending, IDLE_S)
                 job = self._jobs.popleft() if self._jobs else None
                 self._busy, self._visitor.stopped = job is not None, False
+            self._clock.read()  # by which the sequencer stamps its commands
             if job is None:
                 self._guard(self._look)
                 continue

@@ -34,6 +34,8 @@ Position = dict[str, float]
 """Axis -> position in the stage frame, m or rad."""
 TRACK_NS = 40_000_000
 """Largest time between two positions that are told, below the collector's largest gap."""
+COARSE_NS = 20_000_000
+"""Largest step of a coarse clock, which shows the same time twice."""
 TINY = 1e-15
 """Least tolerance, m or rad: one of 0 is allowed."""
 TRIES = 3
@@ -381,7 +383,9 @@ class Visitor:
         """
         before = self.clock.now_ns()
         indicated = self._ask("position")
-        stamp = max((before + self.clock.now_ns()) // 2, self._told_ns + 1)
+        stamp = (before + self.clock.now_ns()) // 2
+        if stamp <= self._told_ns < stamp + COARSE_NS:  # else it was set back
+            stamp = self._told_ns + 1
         try:
             values = tuple(map(float, indicated))
         except (TypeError, ValueError):

@@ -68,7 +68,7 @@ class StageSimulator(CellNode[SimulatorSettings]):
         self._events: Iterator[Event] = iter(())
         self._next: Event | None = None
         self._duty = Duty()
-        self._free_ns = 0  # stamp from which it is idle
+        self._free_ns = self._seen_ns = 0  # from when it is idle; the time as last seen
         if settings.plan:
             self._prepare(read_plan(settings.plan))
         self.subscribe(names.COMMAND, self._on_command)
@@ -159,7 +159,7 @@ class StageSimulator(CellNode[SimulatorSettings]):
                 Placing(view.name, *view.translation_m, view.rotation_rad, command)
             )
         start_ns = max(command.stamp_ns, self.get_clock().now().nanoseconds) + LEAD_NS
-        self._time.ns = max(self._time.ns, start_ns)
+        self._time.ns = start_ns  # before its time, if the clock was set back
         order = view.visit_order or self.settings.visit_order
         self._events = self._visitor.view(
             plate, replace(view, visit_order=order), again
@@ -168,12 +168,19 @@ class StageSimulator(CellNode[SimulatorSettings]):
 
     def _on_timer(self) -> None:
         now_ns = self.get_clock().now().nanoseconds
+        was_set_back = now_ns < self._seen_ns - NS_PER_S
+        self._seen_ns = now_ns
+        if was_set_back:  # what is stamped later would be told after that time
+            self._next, self._events = None, iter(())
         while self._next is not None and self._next.stamp_ns <= now_ns:
             # whatever is raised now, it is told once
             event, self._next = (self._next, None)
             self.tell(event)
             self._next, self._free_ns = next(self._events, None), now_ns
-        if self._next is None and now_ns - self._time.ns >= IDLE_STEPS * self._step_ns:
+        idle_ns = now_ns - self._time.ns
+        if self._next is None and (
+            was_set_back or idle_ns >= IDLE_STEPS * self._step_ns
+        ):
             self._time.ns = now_ns
             self.tell(
                 self._visitor.sample()

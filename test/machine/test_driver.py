@@ -2,6 +2,7 @@
 """What cell_driver does with the commands of a run."""
 
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from selfcal_ros.machine.driver import Driver
 from selfcal_ros.machine.duty import PATIENCE_NS
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.units import NS_PER_S
 from test.support.cells import START_NS, Agreeing, Jumping, write_cell
 from test.support.waiting import wait_until
 
@@ -70,6 +72,29 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
         (event.m, event.n) for event in driver.events if isinstance(event, Detection)
     }
     assert len(seen) == 9
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_stamps_follow_a_clock_that_was_set_between_two_runs(
+    tmp_path, monkeypatch, step_s
+):
+    """By the new time at once, though nothing is commanded: a start waits for samples."""
+    found, machine = write_cell(tmp_path)
+    driver = Driver(found, machine, [].append)
+    try:
+        wait_until(lambda: driver.events, "a sample")
+        real_ns, step_ns = time.time_ns, step_s * NS_PER_S
+        monkeypatch.setattr(time, "time_ns", lambda: real_ns() + step_ns)
+        driver.events.clear()
+
+        def is_set():
+            return driver.events and (
+                abs(driver.events[-1].stamp_ns - time.time_ns()) < NS_PER_S
+            )
+
+        wait_until(is_set, "a sample by the new time")
+    finally:
+        driver.close()
 
 
 def test_a_plate_is_placed_though_the_command_to_measure_follows_at_once(cell):

@@ -2,9 +2,12 @@
 """stage_simulator: it measures what a command asks for, from when the command arrives."""
 
 import json
+import time
 from dataclasses import replace
 
 import pytest
+from builtin_interfaces.msg import Time
+from rosgraph_msgs.msg import Clock
 
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Command, Detection, Phase
@@ -14,6 +17,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.stage_simulator import LEAD_NS, StageSimulator
+from selfcal_ros.units import NS_PER_S
 
 PLATE = Artifact(3, 0.01, 4)
 QUICK = {"exposure_period": 0.005, "encoder_rate": 1000.0}
@@ -112,6 +116,46 @@ def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):
         "plate_moves",
     )
     assert truth["cell"]["exposure_period_s"] == 0.005
+
+
+def test_a_clock_that_is_set_back_is_followed(graph):
+    """At once, so that a start finds samples, and by the next command; a view is given up."""
+    samples, seen = graph.listen(names.ENCODER), graph.listen(names.DETECTIONS)
+    node = graph.node(StageSimulator, use_sim_time=True, **QUICK)
+    publisher = graph.hand.create_publisher(Clock, "/clock", names.STATUS.qos)
+    begin, shown = time.monotonic_ns(), [7_200 * NS_PER_S]
+
+    def tick():
+        seconds, ns = divmod(shown[0] + time.monotonic_ns() - begin, NS_PER_S)
+        publisher.publish(Clock(clock=Time(sec=seconds, nanosec=ns)))
+
+    graph.hand.create_timer(0.005, tick)
+    commands = graph.publisher(names.COMMAND)
+
+    def measured() -> None:
+        seen.clear()
+        command = Command(
+            node.get_clock().now().nanoseconds,
+            Phase.MEASURE,
+            "p",
+            0,
+            View("a"),
+            PLATE,
+            1,
+        )
+        commands.publish(
+            fill(names.COMMAND.type(), from_model.command(command, "stage"))
+        )
+        graph.until(lambda: len(seen) == 13, "9 marks and 4 lines")
+
+    graph.until(lambda: node.get_clock().now().nanoseconds > shown[0], "the time")
+    measured()
+    shown[0] -= 3_600 * NS_PER_S
+    graph.until(
+        lambda: stamp_ns(samples[-1]) < 7_000 * NS_PER_S, "a sample by the new time"
+    )
+    measured()
+    assert max(map(stamp_ns, seen)) < 7_000 * NS_PER_S
 
 
 CHECKED = View("a", angular=False, repeats=2, check_marks=5, check_offset_m=2e-5)
