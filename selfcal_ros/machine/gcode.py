@@ -32,7 +32,7 @@ between the answers to what was given up: Marlin says every 2 s that it is busy.
 SAME_ZERO_MM = 0.02
 """Difference of a position that Marlin tells, to two decimals, from its steps without an offset."""
 HOLD_S = 0.3
-"""Time from a feed hold to the reset: a reset during the motion loses the position."""
+"""Shortest time from a feed hold to the reset: a reset during the motion loses the position."""
 MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
 
 
@@ -101,7 +101,7 @@ class GcodeMachine:
         self._lines = Lines(port, baud, PATIENCE_S)
         try:
             self._talk = _TALKS[dialect](
-                self._lines, self.axes, (password, enable_password)
+                self._lines, self.axes, (password, enable_password), self._feed
             )
             if camera is not None:
                 from selfcal_ros.machine.video import VideoCamera  # extra camera
@@ -181,9 +181,14 @@ class _Talk:
     """Lines that set mm, absolute coordinates and mm/min."""
 
     def __init__(
-        self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]
+        self,
+        lines: Lines,
+        axes: tuple[str, ...],
+        passwords: tuple[str, str],
+        feed: float,
     ) -> None:
         self._lines, self._axes, self._passwords = lines, axes, passwords
+        self._feed = feed
         self._stale = False  # answers of what was given up may still come
         self._may_greet = True  # it is being reset, or may have been before
         self._begin()
@@ -282,10 +287,14 @@ class _Grbl(_Talk):
                 "controller",
                 "let its program end, or leave the mode, first",
             )
-        if any(setting.startswith("$13=1") for setting in self._ok("$$")):
+        settings = self._ok("$$")
+        if any(setting.startswith("$13=1") for setting in settings):
             raise MachineError(
                 "it reports positions in inches ($13=1)", "controller", "set $13=0"
             )
+        # the answers to ? belong to the thread that waits for the end of the move
+        slowing = self._feed / 60 / _least_acceleration(settings, self._axes)
+        self._hold_s = HOLD_S + min(slowing, PATIENCE_S)
 
     def _status(self) -> tuple[str, list[float]]:
         """Return the state, and the machine's position, mm."""
@@ -351,7 +360,7 @@ class _Grbl(_Talk):
 
     def stop(self) -> None:
         self._lines.send_raw(FEED_HOLD)
-        time.sleep(HOLD_S)
+        time.sleep(self._hold_s)
         self._may_greet = True
         self._lines.send_raw(RESET)
 
@@ -377,7 +386,8 @@ class _Marlin(_Talk):
             }
 
     def position(self) -> list[float]:
-        for answer in self._ok(self.QUERY):
+        answers = self._ok(self.QUERY)
+        for answer in answers:
             logical, _, counted = answer.partition("Count")
             position_of_letter = {
                 letter: float(value) for letter, value in NUMBER.findall(logical)
@@ -391,6 +401,13 @@ class _Marlin(_Talk):
             position_of_letter |= by_steps
             if {LETTERS[axis] for axis in self._axes} <= position_of_letter.keys():
                 return [position_of_letter[LETTERS[axis]] for axis in self._axes]
+        if not any(NUMBER.search(answer) for answer in answers):
+            raise MachineError(
+                f"'{self.QUERY}' was answered by 'ok' alone: that of a former command, one "
+                "'ok' too many has come",
+                "controller",
+                "let nothing else write to its port, check cable and its shield, reset it",
+            )
         raise MachineError(
             "M114 tells no position of all axes", "controller", "correct axes"
         )
@@ -509,6 +526,25 @@ class _LinuxCnc(_Talk):
 
     def close(self) -> None:
         self._for_stop.close()
+
+
+ACCELERATION = {"x": "$120=", "y": "$121=", "theta": "$123="}
+"""GRBL's setting of an axis, mm/s^2 or deg/s^2."""
+
+
+def _least_acceleration(settings: list[str], axes: tuple[str, ...]) -> float:
+    """Return the least acceleration of some axes; infinite if none is told."""
+    names = tuple(ACCELERATION[axis] for axis in axes)
+    told = [
+        float(number[0])
+        for number in (
+            re.findall(r"=(\d+\.?\d*)", setting)
+            for setting in settings
+            if setting.startswith(names)
+        )
+        if number
+    ]
+    return min(filter(None, told), default=math.inf)
 
 
 NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")

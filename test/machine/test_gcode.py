@@ -20,6 +20,7 @@ from test.support.firmware import (
     Klipper,
     LinuxCnc,
     Marlin,
+    SlowGrbl,
     over_pty,
     over_tcp,
 )
@@ -124,6 +125,33 @@ def test_a_stop_that_the_connection_does_not_carry_is_an_error(dialect, monkeypa
                 monkeypatch.setattr(lines._serial, "write", lost)
         with pytest.raises(MachineError, match="the connection was lost"):
             machine.stop()
+        machine.close()
+
+
+def test_a_grbl_is_reset_when_it_stands():
+    """A reset while it slows down loses the position."""
+    firmware = SlowGrbl()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "grbl", feed=6000.0)
+        machine.stop()
+        assert machine.position() == (0.0, 0.0)
+        machine.move_to((0.001, 0.0))
+        machine.close()
+    assert firmware.stopped == 2 and not firmware.alarm
+
+
+@pytest.mark.parametrize("dialect", ["marlin", "klipper"])
+def test_an_ok_too_many_is_named(dialect):
+    """All answers after it are those of former commands: M400 is acknowledged in motion."""
+    firmware = KINDS[dialect]()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        machine.move_to((0.001, 0.0))
+        answer = firmware.answer
+        firmware.answer = lambda line: answer(line) + b"ok\n" * (line == "G90")
+        with pytest.raises(MachineError, match="'ok' alone: that of a former command"):
+            machine.move_to((0.002, 0.0))
+            machine.position()
         machine.close()
 
 

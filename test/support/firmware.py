@@ -98,6 +98,24 @@ class Grbl(Firmware):
         ).encode()
 
 
+class SlowGrbl(Grbl):
+    """Slows down at 100 mm/s^2 from 6000 mm/min; a reset before it stands loses the position."""
+
+    settings = b"$10=1\r\n$13=0\r\n$120=100.000\r\n$121=500.000\r\n$122=1.000\r\n"
+    slowing_s = 1.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held_at = 0.0
+
+    def byte(self, byte):
+        if byte == b"!":
+            self.held_at = time.monotonic()
+        elif byte == b"\x18" and time.monotonic() < self.held_at + self.slowing_s:
+            self.alarm = "ALARM:3"
+        return super().byte(byte)
+
+
 class FaultyGrbl(Grbl):
     """Answers wrongly from a status report on; `reports` counts them."""
 
