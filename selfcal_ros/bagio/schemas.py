@@ -5,6 +5,7 @@ Many messages of a channel are decoded at once. Those that the columns cannot de
 rosbags, one by one; failures are counted. Both give the same.
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -53,6 +54,9 @@ COMMON = {
 }
 """The common types required by the contract, as in ROS 2 Jazzy. Loading all 180 of rosbags
 would take 0.1 s of CPU in every command and node that reads or writes a bag."""
+
+IDL_FILE = re.compile(r"^=+\nIDL: .*$", re.MULTILINE)
+INCLUDE = re.compile(r"^#include .*$", re.MULTILINE)
 
 KEPT = 64
 """Number of schemas with cached typestores; a folder of foreign bags has a handful."""
@@ -166,13 +170,20 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
 def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
     """Return the cached typestore of a schema: rosbags generates code for each."""
     types = (
-        get_types_from_idl(text)
-        if encoding == "ros2idl"
-        else get_types_from_msg(text, name)
+        _types_of_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, name)
     )
     for type_name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
         types.setdefault(type_name, typestore().fielddefs[type_name])
     return _store(types)
+
+
+def _types_of_idl(text: str) -> dict[str, Any]:
+    """Return the types of IDL files as rosbag2 joins them; rosbags reads one, without includes."""
+    types: dict[str, Any] = {}
+    for one in IDL_FILE.split(text):
+        if one.strip():
+            types.update(get_types_from_idl(INCLUDE.sub("", one)))
+    return types
 
 
 @cache

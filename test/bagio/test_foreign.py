@@ -6,6 +6,8 @@ import pickle
 import pytest
 import yaml
 import zstandard
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.rosbag2 import CompressionMode, Reader
 
 from selfcal_ros.bagio.mcap_stream import McapStream
@@ -419,6 +421,86 @@ def test_without_definitions_what_does_not_fit_is_said(tmp_path, events):
             (9, "selfcal/view_command", bags.COMMAND_TYPE),
         )
     ]
+
+
+JOINT_STATE_IDL = """{line}
+IDL: sensor_msgs/msg/JointState
+// generated from rosidl_adapter/resource/msg.idl.em
+// with input from sensor_msgs/msg/JointState.msg
+
+#include "std_msgs/msg/Header.idl"
+
+module sensor_msgs {{
+  module msg {{
+    @verbatim (language="comment", text=
+      "This is a message that holds data to describe the state of joints." "\\n"
+      "* the position of the joint (rad or m).")
+    struct JointState {{
+      std_msgs::msg::Header header;
+      sequence<string> name;
+      sequence<double> position;
+      sequence<double> velocity;
+      sequence<double> effort;
+    }};
+  }};
+}};
+
+{line}
+IDL: std_msgs/msg/Header
+#include "builtin_interfaces/msg/Time.idl"
+
+module std_msgs {{
+  module msg {{
+    struct Header {{
+      builtin_interfaces::msg::Time stamp;
+      string frame_id;
+    }};
+  }};
+}};
+
+{line}
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces {{
+  module msg {{
+    struct Time {{
+      int32 sec;
+      uint32 nanosec;
+    }};
+  }};
+}};
+""".format(line="=" * 80)
+"""As rosbag2 joins the files where the .msg is not installed."""
+
+
+def test_definitions_as_idl(tmp_path, events, expected):
+    plain = Foreign().write(tmp_path / "plain.mcap", events)
+    path, channels = tmp_path / "idl.mcap", {}
+    with plain.open("rb") as source, path.open("wb") as target:
+        writer = Writer(target)
+        writer.start("ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.topic not in channels:
+                is_joints = schema.name == "sensor_msgs/msg/JointState"
+                number = (
+                    writer.register_schema(
+                        schema.name, "ros2idl", JOINT_STATE_IDL.encode()
+                    )
+                    if is_joints
+                    else writer.register_schema(
+                        schema.name, schema.encoding, schema.data
+                    )
+                )
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            writer.add_message(
+                channels[channel.topic],
+                message.log_time,
+                message.data,
+                message.publish_time,
+            )
+        writer.finish()
+    check(path, expected)
 
 
 TYPES = {
