@@ -171,7 +171,7 @@ def diagnose(evidence: Evidence) -> RejectionFinding | None:
             }
         ) or _command_clock(evidence)
     elif reason in PLACED:
-        cause = _stage(evidence)
+        cause = _stage(evidence, reason)
     return RejectionFinding(reason, count, total, cause or REMEDY[Reason(reason)])
 
 
@@ -239,7 +239,7 @@ def _seconds(offset_s: float) -> str:
     return f"{abs(offset_s):.0f} s" if abs(offset_s) >= 10 else f"{abs(offset_s):.2g} s"
 
 
-def _stage(e: Evidence) -> str | None:
+def _stage(e: Evidence, reason: str) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
     elsewhen = _encoder_stopped(e) or e.late
     if elsewhen:
@@ -250,7 +250,7 @@ def _stage(e: Evidence) -> str | None:
     if joints or e.lies:
         return "; or, if the joints are right: ".join(filter(None, (joints, e.lies)))
     away = _away(e, lambda stage: stage)
-    if away <= e.limit_m:
+    if away <= e.limit_m or reason == Reason.CONTRADICTION:  # of which place?
         return None
     where = np.concatenate([view.stage for view in e.marks]) * e.pitch_m
     middle = complex(np.median(where.real), np.median(where.imag))

@@ -353,6 +353,23 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     )
 
 
+def test_a_clock_that_stepped_back_is_not_taken_for_a_stage_elsewhere():
+    """Positions between samples of two times are none."""
+    cell = scene(count=0, repeats=4)
+    middle = cell.detections[50].stamp_ns
+    cell.samples = [
+        s if s.stamp_ns < middle else replace(s, stamp_ns=s.stamp_ns - S // 2)
+        for s in cell.samples
+    ]
+    cell.detections = [
+        d if d.stamp_ns < middle else replace(d, stamp_ns=d.stamp_ns - S // 2)
+        for d in cell.detections
+    ]
+    assert findings(cell.events)[None].endswith(
+        "rejected as encoder_contradiction: " + REMEDY[Reason.CONTRADICTION]
+    )
+
+
 REST = "the stage rests at the marks about"
 """Beginning of what is said of detections that are stamped at another time."""
 
