@@ -62,6 +62,9 @@ def run(args: argparse.Namespace) -> int:
     plan, cell = read_plan(args.plan), read_cell(args.cell)
     bag = Path(args.output)
     resume_hint = f"{bag} is kept, --resume continues"
+    result, report = f"{bag}.json", f"{bag}.html"
+    if not (args.resume or plan.verify or bag.exists()):
+        _refuse_files(result, report)
     desk = Terminal(args.yes, bag, aside(args))
     if not args.yes and not sys.stdin.isatty():
         raise InputError(
@@ -95,8 +98,19 @@ def run(args: argparse.Namespace) -> int:
     sense = ["--sense", str(cell.sense)]
     if plan.verify:
         return _followed_by(verify, args, [plan.verify, str(bag), *sense])
-    outputs = ["-o", f"{bag}.json", "--report", f"{bag}.html"]
+    outputs = ["-o", result, "--report", report]
     return _followed_by(solve, args, [str(bag), *outputs, *sense])
+
+
+def _refuse_files(*paths: str) -> None:
+    """Refuse to replace files of somebody else, before hours of measurement."""
+    for path in paths:
+        if Path(path).exists():
+            raise InputError(
+                path,
+                "it exists, and the measurement would be written over it",
+                "name another BAG, or move it elsewhere",
+            )
 
 
 def _followed_by(verb: ModuleType, args: argparse.Namespace, words: list[str]) -> int:

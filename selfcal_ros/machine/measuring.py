@@ -223,32 +223,24 @@ class Run:
                 "name another folder, or give it its former name",
             )
         self._journal = Claim(self.bag).resume()
-        if self._journal is None:
-            self.desk.say(f"{where}: measured already")
-            return []
-        self._declare()
+        if self._journal is not None:
+            self._declare()
         lost: list[str] = []
         feed = block_handlers(self.collector, lost)
         for topic, item in BagReader(self.bag).columns():
             feed[topic](item)
         last = self.collector.newest_command
-        if last is None:
-            return self._sequencer.start()
-        if (
-            last.plan_id != self.plan.plan_id
-            or last.view_index >= len(self.plan.views)
-            or (
-                last.view is None
-                or last.artifact is None
-                or placing_digest(last.artifact, last.view)
-                != placing_digest(self.plan.artifact, self.plan.views[last.view_index])
-            )
-        ):
+        if last is not None and not self._is_planned(last):
             raise InputError(
                 where,
-                f"the interrupted run is of another plan, '{last.plan_id}'",
+                f"its run is of another plan, '{last.plan_id}'",
                 "name the same PLAN.yaml, unchanged, or another folder",
             )
+        if self._journal is None:
+            self.desk.say(f"{where}: measured already")
+            return []
+        if last is None:
+            return self._sequencer.start()
         newest_ns = max(last.stamp_ns, self.collector.encoder_until_ns)
         if self.clock.now_ns() <= newest_ns:
             raise InputError(
@@ -262,6 +254,23 @@ class Run:
         if last.phase == Phase.MEASURE and self._may_go_on():
             return []
         return self._sequencer.redo()
+
+    def _is_planned(self, last: Command) -> bool:
+        """Return whether all views of the run up to its last command are those of the plan."""
+        told = dict(self.collector.timeline.views)
+        if last.view is not None:
+            told[last.view_index] = last.view
+        plate, views = (
+            last.artifact or self.collector.timeline.artifact,
+            self.plan.views,
+        )
+        return last.plan_id == self.plan.plan_id and all(
+            plate is not None
+            and index < len(views)
+            and placing_digest(plate, view)
+            == placing_digest(self.plan.artifact, views[index])
+            for index, view in told.items()
+        )
 
     def _may_go_on(self) -> bool:
         """Return whether the view has readings to go on from, and the plate still lies for it."""

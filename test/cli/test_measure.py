@@ -167,6 +167,18 @@ def test_a_signal_stops_the_stage_and_keeps_the_bag(
     )
 
 
+def test_results_that_stand_beside_the_bag_are_not_replaced(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write_cell(tmp_path)
+    (tmp_path / "bag.json").write_text("mine")
+    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 2
+    assert "bag.json: it exists, and the measurement" in capsys.readouterr().err
+    assert (tmp_path / "bag.json").read_text() == "mine"
+    assert not (tmp_path / "bag").exists()
+
+
 def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_left_alone(tmp_path, "SIGTERM", "left_at_once")

@@ -266,6 +266,22 @@ def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
         )
 
 
+def test_a_bag_that_is_complete_is_not_that_of_another_plan(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    run_of(tmp_path, machine, cell).measure()
+    desk = Agreeing()
+    run_of(tmp_path, machine, cell, desk=desk).measure(resume=True)
+    assert desk.lines[-1].endswith("measured already")
+    for old, new in (
+        ("rotation_deg: 90", "rotation_deg: 180"),
+        ("grid_size: 3", "grid_size: 5"),
+    ):
+        assert old in PLAN
+        (tmp_path / "plan.yaml").write_text(PLAN.replace(old, new))
+        with pytest.raises(InputError, match="its run is of another plan"):
+            run_of(tmp_path, machine, cell).measure(resume=True)
+
+
 def test_what_is_not_there_is_not_continued(tmp_path):
     """A slip in the name of the bag would measure all views again."""
     cell, machine = write_cell(tmp_path)
