@@ -259,16 +259,24 @@ def _nodes_known(system: NormalEquations) -> bool:
     that each node counts by its uncertainty (method, views at any pose).
     """
     return bool(
-        not system.hides_fields
+        _has_enough_readings(system)
+        and not system.hides_fields
         and system.known_sites.mean() >= DETERMINED
         and angular_deficiency(system) == 0
     )
 
 
+def _has_enough_readings(system: NormalEquations) -> bool:
+    """Return whether readings are left for half of the nodes, one for each: the count says it."""
+    grid = system.grid
+    of_marks = 0 if grid.known_plate else np.count_nonzero(grid.read.any(axis=0))
+    return bool(grid.n_readings - of_marks >= DETERMINED * grid.n_sites)
+
+
 def _placed_observability(
     system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
 ) -> Observability:
-    n_known = int(system.known_sites.sum())
+    n_known = int(system.known_sites.sum()) if _has_enough_readings(system) else 0
     grid = system.grid
     if _nodes_known(system):
         n_determined = (

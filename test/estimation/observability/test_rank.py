@@ -10,14 +10,15 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.equations import NormalEquations, PlacedEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import (
+    identifies,
     measured_observability,
     plan_observability,
 )
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import subset
 from selfcal_ros.model.view import Plan, View
@@ -35,6 +36,19 @@ PLANS = [
     ((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1)),
     ((0, 0, 0), (1, 0, 0)),
 ]
+
+
+def test_more_nodes_than_readings_are_refused_by_the_count(monkeypatch):
+    """50 nodes a side in place of 5: the search for views that help took an hour."""
+
+    def never(system):
+        raise AssertionError("the nodes were looked at one by one")
+
+    monkeypatch.setattr(PlacedEquations, "known_sites", property(never))
+    views = plan_of("0,90,tx", Artifact(7, 0.01, 0)).views
+    assert not identifies(Artifact(7, 0.01, 0, map_grid=MapGrid(50, 0.06 / 49)), views)
+    with pytest.raises(AssertionError):
+        identifies(Artifact(7, 0.01, 0, map_grid=MapGrid(5, 0.06 / 4)), views)
 
 
 def dense(grid: GridSystem) -> np.ndarray:
