@@ -17,17 +17,15 @@ OUTPUTS = {"--output", "--report", "--plot", "--theta-output", "--cal", "--save-
 """Options that name a file to write."""
 FOLDERS = ("BAG", "FOLDER", "DIR")
 """Names of outputs that are folders: they are never replaced."""
-FORMATS = {".json": (), ".yaml": (".yml",)}
+FORMATS = {".json": (), ".yaml": (".yml",), ".csv": (".txt",), ".xml": ()}
 """Ending of a file to write, as in the name of its argument -> others that it may have."""
 OTHERS = (
-    ".csv",
     ".html",
     ".pdf",
     ".png",
     ".svg",
     ".txt",
     ".mcap",
-    ".xml",
     ".cal",
     *FORMATS,
 )

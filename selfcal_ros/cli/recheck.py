@@ -28,6 +28,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Collect, find the map and its change, print both and write the result."""
+    if args.reference:
+        raise InputError(
+            "--reference",
+            "a recheck always uses the reference length of the plate's calibration",
+            "leave it out",
+        )
     return solve.run(args)
 
 

@@ -13,6 +13,8 @@ from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.plain_numbers import number_of, whole_number_of
 
+MAX_RELATIVE = 0.1
+"""Relative error, and its u, above which a length is not the one that is meant."""
 MAX_EXPANSION_PER_K = 1e-3
 """Coefficient of linear expansion above that of any solid, 1/K."""
 LEAST_EXPANSION_PER_K = -2e-6
@@ -177,6 +179,13 @@ class ReferenceLength:
         )
         if nominal == 0:
             raise InputError(where, f"'{text}' names one mark twice", "name two marks")
+        if not abs(length - nominal) < MAX_RELATIVE * nominal:
+            raise InputError(
+                where,
+                f"{length:g} in '{text}' is not the distance of these marks, nominally "
+                f"{nominal:g} m",
+                "give m",
+            )
         return cls(
             ReferenceKind.MARKS,
             (length - nominal) / nominal,
@@ -197,13 +206,13 @@ class ReferenceLength:
                 "the kind 'marks' needs two different marks, other kinds have none",
             )
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
-        if not abs(self.relative_error) < 0.1:
+        if not abs(self.relative_error) < MAX_RELATIVE:
             raise InputError(
                 "reference length",
                 f"{self.relative_error} is not a relative error",
                 "give (true - nominal) / nominal, below 0.1",
             )
-        if not 0 <= self.u_relative < 0.1:
+        if not 0 <= self.u_relative < MAX_RELATIVE:
             raise InputError(
                 "reference length",
                 f"{self.u_relative} is not a standard uncertainty of a relative error",
@@ -241,16 +250,19 @@ class ReferenceLength:
             len(numbers) not in (4, 5)
             or not all(map(math.isfinite, numbers))
             or min(values["u_temperature_k"], values["u_expansion_per_k"]) < 0
-            or not (
-                LEAST_EXPANSION_PER_K
-                <= values["expansion_per_k"]
-                <= MAX_EXPANSION_PER_K
-            )
         ):
             raise InputError(
                 "reference length",
                 f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
                 "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)",
+            )
+        expansion = values["expansion_per_k"]
+        if not LEAST_EXPANSION_PER_K <= expansion <= MAX_EXPANSION_PER_K:
+            raise InputError(
+                "reference length",
+                f"{expansion:g} in '{text}' is not a coefficient of expansion from "
+                f"{LEAST_EXPANSION_PER_K:g} to {MAX_EXPANSION_PER_K:g} 1/K",
+                "give 1/K, as 0.5e-6 of fused silica",
             )
         for name in ("temperature_c", "certified_at_c"):
             check_celsius(values[name], "reference length", f" in '{text}'")

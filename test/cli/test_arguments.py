@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments: no file, no value is replaced unless told; a file of another kind is named."""
 
+import re
 import shlex
 
 import pytest
@@ -60,6 +61,25 @@ def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
     assert (desk / out).read_text() == "mine"
     assert main([*words.split(), "--force"]) in (0, 5)
     assert (desk / out).read_text() != "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            "apply R.json points.csv -o out.json",
+            "OUT.csv .* which is not .json; .* .csv",
+        ),
+        (
+            "certificate R.json d.yaml -o out.txt",
+            "DCC.xml .* which is not .txt; .* .xml",
+        ),
+        ("solve bags/demo -o out.csv", "RESULT.json .* which is not .csv; .* .json"),
+    ],
+)
+def test_the_ending_of_another_kind_is_refused(desk, capsys, words, line):
+    assert main(words.split()) == 2
+    assert re.search(line, capsys.readouterr().err)
 
 
 def test_an_empty_file_and_a_device_are_written(desk):

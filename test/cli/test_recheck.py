@@ -154,6 +154,12 @@ def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
     )
 
 
+def test_a_reference_of_its_own_is_refused_by_its_option(folder, capsys):
+    asked = ["recheck", str(folder / "r.json"), str(folder / "same")]
+    assert main([*asked, "--reference", "artifact:1e-6:1e-7"]) == 2
+    assert capsys.readouterr().err.startswith("selfcal recheck: --reference: a recheck")
+
+
 @pytest.mark.parametrize(
     ("option", "where"), [("--validate", "--validate"), ("--robust", "robust")]
 )
