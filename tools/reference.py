@@ -142,11 +142,12 @@ RESULT = {
 SOMETIMES = {
     "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "
     "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
-    "(_theta)",
+    "(_theta; agrees is null, and agrees_theta left out, where there is no noise to test it by)",
     "map_covariance": "covariance of a mean map or a recheck up to 21 × 21 sites, lower "
     "triangles over Gx, then Gy, of the known sites (`xy`) and over the known lines "
     "(`theta`), in units of scale_xy (m²), scale_theta (rad²)",
     "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
+    "turned": "views whose lines turned slowly while they were read in passes, which was taken out",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",

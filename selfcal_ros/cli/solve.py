@@ -27,7 +27,7 @@ from selfcal_ros.cli.terminal import (
     warn,
 )
 from selfcal_ros.collection.inputs import rejections
-from selfcal_ros.collection.reduce import with_places
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.errors import InputError, NotIdentifiableError, SelfcalError, printable
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
@@ -274,7 +274,7 @@ def run(args: argparse.Namespace) -> int:
         error = with_advice(refused)
         if error.observability is not None:
             result = unidentified_result(measurements, error.observability)
-            result = with_places(result, measurements.views)
+            result = with_collected(result, measurements.views)
             _write(args, _described(args, result, session.lost))
         raise _first_fault(args.bag, error, session) from refused
     if options.plate is not None:
@@ -377,7 +377,7 @@ def _validated(
 ) -> tuple[CalibrationResult, list[str]]:
     """Return the result with places, validated if requested, and the text to print."""
     lines: list[str] = []
-    result = with_places(result, measurements.views)
+    result = with_collected(result, measurements.views)
     if args.validate:
         used = (
             clean(measurements, options).measurements

@@ -26,6 +26,7 @@ from selfcal_ros.collection.marks.rigid import Rigid
 from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.parts import RejectedAt
+from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
@@ -627,10 +628,11 @@ def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
         rejected[str(reason)] += int(mask.sum())
 
 
-def with_places(
+def with_collected(
     result: CalibrationResult, views: Iterable[ViewReadings]
 ) -> CalibrationResult:
-    """Return the result with the positions of rejected detections, if any."""
+    """Return the result with what the readings do not show: places of rejections, turned lines."""
+    views = tuple(views)
     rejected_at = tuple(
         RejectedAt(
             view.view.name,
@@ -641,8 +643,10 @@ def with_places(
         for view in views
         if view.places.reason
     )
-    return (
-        replace(result, parts=replace(result.parts, rejected_at=rejected_at))
-        if rejected_at
-        else result
+    turned = tuple(
+        without_cell(view.view.name) for view in views if view.is_without_turning
     )
+    parts = replace(
+        result.parts, rejected_at=rejected_at or None, turned=turned or None
+    )
+    return replace(result, parts=parts)

@@ -275,6 +275,8 @@ class Parts:
         Of all readings; not of large fields.
     rejected_at : tuple of RejectedAt
         Positions of rejected grid detections.
+    turned : tuple of str
+        Views whose lines turned slowly while they were read, which was taken out.
     outliers : Outliers
         What a robust calibration removed.
     slips, noisy_views : tuple
@@ -287,6 +289,7 @@ class Parts:
 
     residuals: ResidualsOfViews | None = None
     rejected_at: tuple[RejectedAt, ...] | None = None
+    turned: tuple[str, ...] | None = None
     outliers: Outliers | None = None
     slips: tuple[Slip, ...] | None = None
     noisy_views: tuple[ViewNoise, ...] | None = None

@@ -313,6 +313,11 @@ class ViewReadings:
         """The readings that are solved: those of the cells, or these."""
         return self.cells or (self,)
 
+    @property
+    def is_without_turning(self) -> bool:
+        """Whether a slow turning of all lines was taken out of their repeats: it costs dof."""
+        return 0 < self.dof_theta < int((self.count_theta - 1).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class Measurements:

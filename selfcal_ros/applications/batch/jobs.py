@@ -13,7 +13,7 @@ from pathlib import Path
 from selfcal_ros.applications.batch import folder
 from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.collection.reduce import with_places
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model import result as results
@@ -81,7 +81,7 @@ def solved(
     problem = None
     try:
         calibrated = calibrate_by(settings.solver.method, session.measurements, options)
-        result = worded(with_places(calibrated, session.measurements.views))
+        result = worded(with_collected(calibrated, session.measurements.views))
     except NotIdentifiableError as error:
         if not isinstance(error.observability, results.Observability):
             raise

@@ -20,7 +20,7 @@ from selfcal_ros.collection.inputs import (
     check_plate,
     check_view,
 )
-from selfcal_ros.collection.reduce import with_places
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.errors import (
     InputError,
     NoDataError,
@@ -112,7 +112,7 @@ def _verified(job: Job) -> results.CalibrationResult:
 
 def _finished(job: Job, result: results.CalibrationResult) -> results.CalibrationResult:
     """Return the result of a job with everything that a result from the bag has."""
-    result = worded(with_places(result, job.measurements.views))
+    result = worded(with_collected(result, job.measurements.views))
     return results.with_warnings(result, job.notes)
 
 

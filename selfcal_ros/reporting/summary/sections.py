@@ -488,7 +488,16 @@ def noise_section(result: CalibrationResult) -> Section:
                 "not known: no mark was read twice and no detection declared its uncertainty",
             ),
         )
-    return Section("Noise", table=(header, *rows))
+    return Section("Noise", table=(header, *rows), notes=_turned_notes(result))
+
+
+def _turned_notes(result: CalibrationResult) -> tuple[str, ...]:
+    """Return what was taken out of the repeats of lines."""
+    names = ", ".join(f"'{name}'" for name in result.parts.turned or ())
+    text = (
+        f"all lines turned slowly while they were read, in {names}: this was taken out"
+    )
+    return (text,) if names else ()
 
 
 def _dof(dof: float) -> str:

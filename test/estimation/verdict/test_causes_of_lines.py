@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import kstest
 
 from selfcal_ros.collection.inputs import Kind, Phase
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.joint.model_fit import fit_model
@@ -19,6 +20,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -251,6 +253,7 @@ def test_a_plate_that_turns_while_its_lines_are_read_hides_no_other_fault():
     )
     readings, _ = collect(cell.events)
     assert calibrate(readings).verdict.grade is Grade.GOOD
+    assert with_collected(calibrate(readings), readings.views).parts.turned is None
 
     begun = [one.stamp_ns for one in cell.commands if one.phase is Phase.MEASURE]
     stamps = np.array([one.stamp_ns for one in cell.detections])
@@ -268,6 +271,11 @@ def test_a_plate_that_turns_while_its_lines_are_read_hides_no_other_fault():
                 index, offset_theta=line.offset_theta + sigma_rad * (turning + oval)
             )
     readings, _ = collect(cell.events)
-    noise = calibrate(readings).noise
-    assert noise.sigma_theta_repeats < 1.3 * sigma_rad
-    assert not calibrate(readings).verdict.qualified
+    result = with_collected(calibrate(readings), readings.views)
+    assert result.noise.sigma_theta_repeats < 1.3 * sigma_rad
+    assert not result.verdict.qualified
+    assert result.parts.turned == ("0", "90", "tx", "line")
+    assert (
+        "turned slowly while they were read, in '0', '90', 'tx', 'line': "
+        in summary_text(result)
+    )

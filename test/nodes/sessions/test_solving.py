@@ -20,6 +20,7 @@ from selfcal_ros.collection.inputs import (
     Phase,
     begun_ns,
 )
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
@@ -145,9 +146,10 @@ def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
     shown = desk.session.result
     readings = collected(events_of(plan))[1]
     assert readings.artifact_from == path
-    offline = worded(
-        calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings))
+    found = calibrate(
+        readings, solver_options(SolverSettings.checked({}, ""), readings)
     )
+    offline = worded(with_collected(found, readings.views))
     assert json.dumps(
         result_to_dict(replace(shown, run_id=offline.run_id))
     ) == json.dumps(result_to_dict(offline))
