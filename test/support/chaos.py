@@ -35,7 +35,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection
-from selfcal_ros.errors import ExitCode, NotIdentifiableError
+from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.model.view import Plan
@@ -165,7 +165,7 @@ class Story:
         try:
             calibrate(measurements)
             self.faults.append(f"no map: {message}")
-        except NotIdentifiableError as error:
+        except SelfcalError as error:
             if str(error) not in message:
                 self.faults.append(f"refused with '{message}' instead of '{error}'")
         return f"refused: {message}"

@@ -23,7 +23,7 @@ from typing import cast
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M, MAX_REMOVED
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import EDGE, AnyPose, LatticePose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
@@ -157,7 +157,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
         spread,
         _alike(views, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0),
     )
-    planned, square = _likelihood(views, *sizes)
+    as_planned = _FactoredReadings(views, [], *sizes)
+    planned, square = as_planned.with_moved([])
     if square < EXPLAINED:
         return None
     tried = []
@@ -180,7 +181,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
             )
             tried.append((likelihood - planned, mean_square, view, readings.pose, pose))
     tried.sort(key=lambda item: -item[0])
-    best = max(tried[0][0] if tried else 0.0, 0.0)
+    of_outliers = as_planned.gain_without_outliers()
+    best = max(tried[0][0] if tried else 0.0, of_outliers)
     enough = max(CONTRADICTED, LEFT * square)
     if mirrored := _mirrored(
         views, planned, sizes, max(best + CLEARLY, BETTER), enough
@@ -189,7 +191,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if not tried:
         return None
     gain, mean_square, view, planned_pose, pose = tried[0]
-    second = tried[1][0] if len(tried) > 1 else 0.0
+    second = max(tried[1][0] if len(tried) > 1 else 0.0, of_outliers)
     if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
     return Misplaced.of(view.plan_view, planned_pose, pose)
@@ -474,6 +476,32 @@ class _FactoredReadings:
             -square / 2 - 2 * np.log(sizes).sum() - np.linalg.slogdet(inner[:, :-1])[1]
         )
         return float(likelihood), float(square / 2 / (len(white) - self.free))
+
+    def gain_without_outliers(self) -> float:
+        """Return how far the log-likelihood grows if the readings that are off are left out.
+
+        The worst one after another, as long as each gains more than chance does. A single reading
+        that is off contradicts all that share its mark or its site, as a plate does that lies
+        otherwise, and at another pose it may share neither with any.
+        """
+        columns, deviations = self.white[:, :-1], self.white[:, -1]
+        basis = np.linalg.qr(columns)[0]
+        fitted = self.whiten - basis @ (basis.conj().T @ self.whiten)
+        precision = fitted.conj().T @ fitted
+        pull = fitted.conj().T @ deviations
+        least = np.sqrt(np.finfo(float).eps) * precision.diagonal().real.max()
+        total = 0.0
+        for _ in range(int(MAX_REMOVED * len(pull))):
+            checked = np.maximum(precision.diagonal().real, least)
+            gains = np.abs(pull) ** 2 / checked / 2
+            worst = int(gains.argmax())
+            if gains[worst] < CLEARLY:
+                break
+            total += float(gains[worst]) - CLEARLY
+            response = precision[:, worst] / checked[worst]
+            pull = pull - response * pull[worst]
+            precision = precision - np.outer(response, precision[worst])
+        return total
 
     @cached_property
     def whiten(self) -> np.ndarray:

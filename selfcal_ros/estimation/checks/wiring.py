@@ -44,6 +44,8 @@ DOUBLED, HALVED = 1.5, 0.7
 """Scales beyond which an offset is in wrong units; nearer to 1 the scale is fitted."""
 BEYOND = 3.0
 """Standard uncertainties beyond which a value is not chance: 0.3 % of good ones are."""
+MAX_REMOVED = 0.1
+"""Largest share of readings that are outliers; if it is more, the fault is another one."""
 
 LEAST_SLOPE = 0.3
 """Scale below which an offset is taken not to follow the stage."""

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.checks.wiring import BEYOND_DOUBT
+from selfcal_ros.estimation.checks.wiring import BEYOND_DOUBT, MAX_REMOVED
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -55,7 +55,6 @@ from selfcal_ros.estimation.verdict.causes import (
 from selfcal_ros.estimation.verdict.leverage import (
     FEW_DRAWS,
     FEW_OUTLIERS,
-    MAX_REMOVED,
     FitOfKind,
     lines_alone,
     marks_alone,

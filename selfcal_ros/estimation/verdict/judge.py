@@ -22,6 +22,7 @@ from selfcal_ros.blocks import traits_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import (
     LEAST_NOISE_M,
+    MAX_REMOVED,
     SHOWN,
     contradicted_scale,
     sign_is_shown,
@@ -48,7 +49,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
-from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
+from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,

@@ -25,9 +25,6 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 FEW_DRAWS = 16
 """Draws of noise where a sum over many readings is wanted: one draw tells it to a few per cent."""
 
-MAX_REMOVED = 0.1
-"""Largest share of readings that are outliers; if it is more, the fault is another one."""
-
 FEW_OUTLIERS = 5
 """Outliers that are few: among repeats of a view no more may be chance, and a finding names as
 many."""

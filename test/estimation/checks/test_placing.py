@@ -13,7 +13,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, subset
 from test.support.collecting import collect, gathered, scene
 from test.support.mark_lists import lattice, rings, scatter
 from test.support.misplaced import NOISE, laid, laid_at
@@ -111,6 +111,20 @@ def test_a_contradiction_that_hides_in_scattered_repeats_tells_how_a_plate_lies(
     )
     found = misplaced(drifting)
     assert found is not None and (found.view, found.found_deg) == (names[1], 270)
+
+
+def test_single_readings_that_are_off_are_not_a_plate_that_lies_otherwise():
+    """At another pose, with marks missing, they share neither site nor mark with any."""
+    readings, _ = read("0, 90, tx", "0, 90, tx")
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        views = []
+        for view in readings.views:
+            seen = subset(view, rng.random(len(view.m)) < 0.75, np.zeros(0, dtype=int))
+            off = np.zeros(len(seen.m))
+            off[rng.integers(len(off))] = 5e-6
+            views.append(replace(seen, dx=seen.dx + off, dy=seen.dy - off / 2))
+        assert misplaced(replace(readings, views=tuple(views))) is None
 
 
 def unrepeated(readings):
