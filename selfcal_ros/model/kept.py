@@ -26,6 +26,12 @@ LACK_OF_FIT = "lack_of_fit"
 ROUGHNESS = "roughness"
 """Name of the effect of what the nodes of a map do not follow."""
 
+REVERSAL = "reversal"
+"""Name of the effect of a direction of approach that does not do the same everywhere."""
+
+OF_EACH_PLACE = (LACK_OF_FIT, ROUGHNESS, REVERSAL)
+"""Effects that have a sign of their own at each place."""
+
 NOISE = "noise"
 """Name of the effect of views that are noisier than the others."""
 
@@ -112,8 +118,8 @@ class Factors:
 
     @property
     def of_each_place(self) -> np.ndarray:
-        """Factors of what has a sign of its own at each place, bool (r,)."""
-        return np.isin(self.terms, (LACK_OF_FIT, ROUGHNESS))
+        """Factors of `OF_EACH_PLACE`, bool (r,)."""
+        return np.isin(self.terms, OF_EACH_PLACE)
 
     @property
     def of_size(self) -> np.ndarray:

@@ -20,10 +20,9 @@ from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_everywhere
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.findings import Cause
+from selfcal_ros.model.kept import REVERSAL
 from selfcal_ros.model.readings import turned_over
 from selfcal_ros.model.result import CalibrationResult
-
-REVERSAL = "reversal"
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import reversal
@@ -91,6 +92,33 @@ def test_a_reversal_that_differs_over_the_field_is_named_and_in_u(
         assert "reversal" in [item.name for item in result.verdict.enlarged_by]
         shares.append(covered(result, truth.g))
     assert min(shares) >= 0.85 and np.mean(shares) > 0.9
+
+
+def test_distances_have_it_in_u_whatever_their_length():
+    """As a field with alternating signs it was in one of 10 nm or of 200, at every other pitch."""
+    beyond = []
+    for seed in range(4):
+        truth, readings = measured(seed, rising)
+        result = calibrate(readings, Options())
+        everywhere = np.ones((7, 7), dtype=bool)
+        of_x = covariance_of(result, "xy", everywhere)[:49, :49].reshape(7, 7, 7, 7)
+        at_edge = of_x[0, :, 0, :]  # the nodes of the first column
+        u_of_steps = [
+            np.sqrt(at_edge[0, 0] + at_edge[n, n] - 2 * at_edge[0, n])
+            for n in range(1, 7)
+        ]
+        assert max(u_of_steps) < 1.4 * min(u_of_steps)
+
+        error = result.error_map.gx - truth.g[0]
+        across = error[-1] - error[0]
+        u_across = np.sqrt(
+            [
+                of_x[6, n, 6, n] + of_x[0, n, 0, n] - 2 * of_x[6, n, 0, n]
+                for n in range(7)
+            ]
+        )
+        beyond += list(np.abs(across) > 2 * u_across)
+    assert np.mean(beyond) < 0.1
 
 
 def test_a_constant_reversal_differs_nowhere():
