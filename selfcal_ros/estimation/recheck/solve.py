@@ -682,9 +682,10 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
 def _noise(
     measurements: Measurements, problem: Problem, plate: KnownPlate
 ) -> tuple[NoiseEstimate, NoiseEstimate]:
-    """Return the noise of the readings: declared, of many repeats, or that of the calibration.
+    """Return the noise of the readings: of many repeats, else that of the calibration.
 
-    What detections of images declare is the noise of a mark, without that of its image.
+    It is what detections declare if that is larger: no residual tests whether they declare too
+    little. What detections of images declare is the noise of a mark, without that of its image.
     """
     before = plate.result.noise
     nan = float("nan")
@@ -700,14 +701,15 @@ def _noise(
         ("xy", of_marks, of_mark),
         ("theta", problem.repeats_theta, problem.angular.sigma_declared),
     ):
-        noise = noise_estimate(repeats, (nan, 0), declared)
+        noise = noise_estimate(repeats, (nan, 0), nan)
         if not (noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF):
             noise = replace(
                 noise,
                 sigma=getattr(before, f"sigma_{kind}"),
                 dof=getattr(before, f"dof_{kind}"),
             )
-        out.append(noise)
+        larger = max(noise.sigma, np.nan_to_num(declared))
+        out.append(replace(noise, sigma=larger, declared=declared))
     return out[0], out[1]
 
 

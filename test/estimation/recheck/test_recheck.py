@@ -311,6 +311,24 @@ def test_the_noise_is_that_of_many_repeats_or_of_the_calibration():
         assert recheck(more, linear(), plate).noise.sigma_xy == pytest.approx(sigma)
 
 
+def test_the_noise_is_what_detections_declare_if_that_is_larger():
+    """With a declaration of 60 nm that of the calibration, 19 nm, was used, as with 96 repeats."""
+    _, after = sessions()
+    plate = known_plate(calibrated(), "r.json")
+    before = plate.result.noise.sigma_xy
+    view = replace(after.views[0], sigma_xy=5e-8, visits=None)
+    for dof, declared, sigma in (
+        (0, 1e-10, before),
+        (0, 6e-8, 6e-8),
+        (96, 1e-10, 5e-8),
+        (96, 6e-8, 6e-8),
+    ):
+        declaring = replace(view, dof_xy=dof, u=declared / np.sqrt(view.count))
+        noise = recheck(replace(after, views=(declaring,)), linear(), plate).noise
+        assert noise.sigma_xy == pytest.approx(sigma)
+        assert noise.sigma_xy_declared == pytest.approx(declared)
+
+
 def test_marks_and_lines_that_are_missing_are_unknown():
     _, after = sessions()
     view = after.views[0]
