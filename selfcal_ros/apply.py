@@ -70,7 +70,7 @@ class StageMap(Compensator):
             result.error_map,
             method=method or default_method,
             outside=outside,
-            fitted=fitted,
+            fitted=fitted if result.reads_between_nodes else None,
         )
         self.result = result
 

@@ -41,7 +41,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm, in_order, parse_terms
-from selfcal_ros.model.view import Plan, parse_order
+from selfcal_ros.model.view import Plan, parse_order, reads_between_nodes
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.reporting.words.observability import worded_observability
@@ -61,8 +61,8 @@ NODES_UNTESTED = (
     "qualified: read every mark twice (repeats: 2), or give the map fewer nodes"
 )
 NODES_ONLY = (
-    "every reading lies at a node of the map: to test the error between nodes, give the "
-    "map its own nodes (map:) and add a view shifted by half a pitch"
+    "every reading lies at a node of the map: to test the error between nodes, add a view "
+    "shifted by half a pitch along x and y, with nodes of the map's own (map:)"
 )
 
 
@@ -335,7 +335,7 @@ def _check_text(
         *([NODES_UNTESTED] if checked.nodes_untested else []),
         *_unchecked_text(observability),
         _check_stops_text(plan),
-        *([] if artifact.map_grid else [NODES_ONLY]),
+        *([] if reads_between_nodes(plan.views, artifact) else [NODES_ONLY]),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}",
     ]

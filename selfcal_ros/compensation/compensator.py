@@ -54,8 +54,8 @@ class Compensator:
         Outside the calibrated field: use the error of the nearest point of its edge, whose
         uncertainty there is not known, or raise.
     fitted : {"bilinear", "bicubic"}, optional
-        Interpolation with which the map was estimated, if it has nodes of its own: what it does not
-        follow is then in the uncertainty of its nodes.
+        Interpolation with which the map was estimated from readings between its own nodes: what it
+        does not follow is then in the uncertainty of these.
 
     Raises
     ------

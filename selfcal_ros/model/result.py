@@ -56,6 +56,7 @@ from selfcal_ros.model.verdict import (
     verdict_to_dict,
 )
 from selfcal_ros.model.verified import Verified
+from selfcal_ros.model.view import View, reads_between_nodes
 from selfcal_ros.outputs import plain
 
 SCHEMA = "selfcal.result/1"
@@ -245,6 +246,16 @@ class CalibrationResult:
         """Interpolation between the nodes of the map; empty if they are the plate's sites."""
         grid = self.plate.map_grid
         return "" if grid is None else str(grid.interpolation)
+
+    @property
+    def reads_between_nodes(self) -> bool:
+        """Whether the readings show what the map lacks between its nodes; False if unknown."""
+        views = (
+            View(v.name, v.rotation, (v.translation_x, v.translation_y), angular=False)
+            for v in self.views
+            if v.read_grid is None or np.any(v.read_grid)
+        )
+        return reads_between_nodes(views, self.plate)
 
     @property
     def has_uncertainty(self) -> bool:

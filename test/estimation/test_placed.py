@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
@@ -17,9 +18,18 @@ from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.view import View, reads_between_nodes
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
-from test.support.placed import SIX, THREE, dense, error_in_datum, plate, readings
+from test.support.placed import (
+    PITCH_M,
+    SIX,
+    THREE,
+    dense,
+    error_in_datum,
+    plate,
+    readings,
+)
 from test.support.results import trusted
 from test.support.truth import simulate_measurements
 
@@ -409,3 +419,51 @@ def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, untested)
 def test_numbers_of_nodes_that_are_none_are_refused(nodes):
     with pytest.raises(InputError, match="is not NODES"):
         with_nodes(plate(9, 5, "bilinear"), f"{nodes}:bicubic", "--map")
+
+
+AT_NODES = ((0, (0, 0)), (90, (0, 0)), (180, (0, 0)), (0, (1, 0)), (0, (0, 1)))
+
+
+def between_nodes(result, stage):
+    """Return errors of a map over its u at places between its nodes, without its datum."""
+    used = StageMap(result)
+    x, y = np.meshgrid(np.linspace(-0.04, 0.04, 41), np.linspace(-0.04, 0.04, 41))
+    places = (x + 1j * y).ravel()
+    errors = np.array(used.error(x, y)).reshape(2, -1)
+    wrong = errors[0] + 1j * errors[1] - stage(places)
+    ones = np.ones(len(places))
+    datum = [
+        np.concatenate([mode.real, mode.imag])
+        for mode in (ones, 1j * ones, places, 1j * places)
+    ]
+    both = np.concatenate([wrong.real, wrong.imag])
+    both -= np.array(datum).T @ np.linalg.lstsq(np.array(datum).T, both, rcond=None)[0]
+    return both / np.array(used.uncertainty(x, y)).ravel()
+
+
+@pytest.mark.parametrize("how", ["bilinear", "bicubic"])
+def test_u_between_nodes_holds_where_every_reading_lies_at_a_node(how):
+    """It was that of the nodes: 24 and 90 % of places in 2 u, and good."""
+
+    def stage(z):
+        x, y = z.real, z.imag
+        return 3e-7 * np.sin(120 * x) * np.cos(80 * y) + 2e-7j * np.cos(90 * x + 60 * y)
+
+    measured, _ = readings(
+        plate(9, 9, how), AT_NODES, np.random.default_rng(3), stage=stage
+    )
+    result = calibrate(measured)
+    assert not result.reads_between_nodes
+    assert (np.abs(between_nodes(result, stage)) < 2).mean() > 0.95
+
+
+def test_readings_between_the_nodes_are_seen():
+    nine = plate(9, 9)
+    for poses, seen in ((AT_NODES, False), (SIX, True)):
+        views = readings(nine, poses, np.random.default_rng(0))[0].views
+        assert reads_between_nodes([view.view for view in views], nine) is seen
+    half_along_x = [
+        View("as it is", 0.0, (0.0, 0.0)),
+        View("half a pitch along x", 0.0, (0.5 * PITCH_M, 0.0)),
+    ]
+    assert not reads_between_nodes(half_along_x, nine)

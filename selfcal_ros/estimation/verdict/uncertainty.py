@@ -532,20 +532,28 @@ def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetL
 
 
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
-    """Estimate the error of linear interpolation; none with the nodes' own interpolation.
+    """Estimate the error of interpolation; none where readings between the nodes show it.
 
-    What a map with nodes of its own does not follow is its lack of fit, part of its uncertainty.
-    A spline needs all of its nodes: with an unknown one the map is used linearly.
+    It is then lack of fit, part of the uncertainty at the nodes. A spline needs all of its nodes:
+    with an unknown one the map is used linearly.
     """
     emap = result.error_map
     grid = result.plate.map_grid
-    if grid is not None:
-        is_linear = grid.interpolation is Interpolation.BILINEAR
-        if is_linear or emap.valid.all():
-            return _interpolation("xy", 0.0, 0.0)
+    is_spline = (
+        grid is not None
+        and grid.interpolation is Interpolation.BICUBIC
+        and bool(emap.valid.all())
+    )
+    as_fitted = grid is not None and (
+        is_spline or grid.interpolation is Interpolation.BILINEAR
+    )
+    if as_fitted and result.reads_between_nodes:
+        return _interpolation("xy", 0.0, 0.0)
     errors = [
         [
-            error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))
+            error_halfway(
+                np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0), cubic=is_spline
+            )
             for axis in (0, 1)
         ]
         for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))

@@ -118,6 +118,7 @@ class CompensatingSession:
             f"{read_from}, plan {result.plan_id}",
             0,
             result.interpolation,
+            reads_between_nodes=result.reads_between_nodes,
         )
 
     def take_map(self, message: Any) -> None:
@@ -228,11 +229,18 @@ class CompensatingSession:
         return ""
 
     def _use(
-        self, error_map: ErrorMap, source: str, stamp_ns: int, interpolation: str
+        self,
+        error_map: ErrorMap,
+        source: str,
+        stamp_ns: int,
+        interpolation: str,
+        *,
+        reads_between_nodes: bool = False,
     ) -> None:
         """Use a map with the interpolation stated with it, or that of the parameter.
 
-        With unknown nodes there is no spline: such a map is interpolated bilinearly.
+        With unknown nodes there is no spline: such a map is interpolated bilinearly. Messages do
+        not state whether anything was read between the nodes.
         """
         self._refuse_large(
             error_map, [error_map.gx, error_map.gy], error_map.g_theta, source
@@ -246,8 +254,9 @@ class CompensatingSession:
                 f"known are {' and '.join(get_args(Interpolation))}",
             )
         if interpolation:
-            fitted = cast(Interpolation, interpolation)
-            method = fitted if error_map.valid.all() else "bilinear"
+            stated = cast(Interpolation, interpolation)
+            method = stated if error_map.valid.all() else "bilinear"
+            fitted = stated if reads_between_nodes else None
         use = Compensator(
             error_map, method=method, fitted=fitted, outside=self._settings.outside
         )

@@ -18,7 +18,11 @@ from selfcal_ros.model.budget import OfNoise
 from selfcal_ros.model.error_map import first_order
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceLength
-from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.result import (
+    CalibrationResult,
+    result_from_dict,
+    result_to_dict,
+)
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
@@ -215,7 +219,7 @@ def test_the_reference_is_not_counted_twice():
     assert found["reading noise"].effect_max == pytest.approx(noise.effect_max)
 
 
-def test_interpolation_error_of_a_parabola_is_the_exact_one():
+def test_interpolation_error_of_a_parabola_is_the_exact_one(monkeypatch):
     result = calibrated()
     x = ARTIFACT.x_m
     nothing = np.zeros(ARTIFACT.shape)
@@ -227,12 +231,19 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one():
     middle = 1e-3 * 0.01**2 / 4
     assert part.effect_max == pytest.approx(middle)
     assert part.effect_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
-    nodes = replace(result, placed_plate=replace(ARTIFACT, map_grid=MapGrid(9, 0.01)))
+    linear = MapGrid(9, 0.01, Interpolation.BILINEAR)
+    nodes = replace(result, placed_plate=replace(ARTIFACT, map_grid=linear))
+    at_nodes = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
+    assert at_nodes == part
+    monkeypatch.setattr(CalibrationResult, "reads_between_nodes", True)
     part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
     assert part.effect_max == part.effect_rms == 0
 
 
-def test_a_spline_with_an_unknown_node_has_the_error_of_the_linear_map_that_is_used():
+def test_a_spline_with_an_unknown_node_has_the_error_of_the_linear_map_that_is_used(
+    monkeypatch,
+):
+    monkeypatch.setattr(CalibrationResult, "reads_between_nodes", True)
     result = calibrated(angular=False)
     grid = MapGrid(9, 0.01)
     nodes = replace(result, placed_plate=replace(result.plate, map_grid=grid))
