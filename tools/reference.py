@@ -127,7 +127,8 @@ RESULT = {
     "default), details, text",
     "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
-    "those of lack_of_fit and roughness add to variances alone, that of noise scales the others; "
+    "those of lack_of_fit, roughness and reversal add to variances alone, that of noise "
+    "scales the others; "
     "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
     "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
     "microscope, (r, 4), the last two times the plate's longer half width; "
