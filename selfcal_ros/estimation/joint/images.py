@@ -260,7 +260,9 @@ def _fitted_terms(system: NormalEquations, columns: np.ndarray) -> FittedTerms:
     residuals = np.zeros(columns.shape, dtype=complex)
     parameters = np.zeros((len(columns), 3 * grid.n_views))
     for number, column in enumerate(columns):
-        residuals[number], parameters[number], _ = _solved(system, column[grid.read])
+        residuals[number], parameters[number], _ = fitted_alone(
+            system, column[grid.read]
+        )
     flat = residuals[:, grid.read]
     gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
     norm = np.abs(flat).max(initial=0.0)
@@ -292,7 +294,7 @@ def _drawn(
             for size in (len(images.stop), images.stop.max() + 1)
         )
         solved = [
-            _solved(system, values / np.sqrt(images.weight))
+            fitted_alone(system, values / np.sqrt(images.weight))
             for values in (mark, image[images.stop])
         ]
         power += [of_noise[2] for of_noise in solved]
@@ -328,7 +330,7 @@ def stops_of(views: CellsSeen, read: np.ndarray) -> np.ndarray:
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _solved(
+def fitted_alone(
     system: NormalEquations, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return residuals (views, nx, ny), misalignments and square of the map of readings (n,).

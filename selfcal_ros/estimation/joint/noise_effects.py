@@ -21,6 +21,7 @@ from selfcal_ros.estimation.joint.problem import (
     SAME,
     noise_excess,
 )
+from selfcal_ros.estimation.joint.slow_motion import slow_motion
 from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.normal.equations import BLOCK
 from selfcal_ros.estimation.terms.visits import ViewVisits
@@ -79,7 +80,7 @@ def structured(
             return np.einsum("vij,kvij->k", weight, (turn * sensitivities**2).real)
 
         added = contrast * added_variances(cover, along_x, rows)
-    if len(correlation := time_correlation(model)):
+    if slow_motion(model) is None and len(correlation := time_correlation(model)):
         added = added + correlated_variances(model, cover, correlation, rows)
     return added + image_variances(model, cover, rows)
 
@@ -93,7 +94,7 @@ def image_variances(
 ) -> np.ndarray | float:
     """Return what the noise that marks of an image share adds to the variances for unit noise.
 
-    Those of the stage's map, of functionals `rows` of it, or of the plate's map.
+    More if it is slow. Those of the stage's map, of functionals `rows` of it, or of the plate's.
 
     Where noise of the offsets is all that shows a microscope, its columns exaggerate the
     sensitivities: then noise of a mark must not make more than the variance itself.
@@ -112,7 +113,10 @@ def image_variances(
         added = added * np.minimum(
             1.0, variance / np.where(of_marks > 0, of_marks, 1.0)
         )
-    return share * added
+    added = share * added
+    if motion := slow_motion(model):
+        added = added + added_variances(cover, motion.added, rows, plate=plate)
+    return added
 
 
 def added_variances(
