@@ -22,7 +22,6 @@ three nodes.
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from math import ceil
 from typing import cast
 
@@ -60,19 +59,13 @@ class LatticeViews:
 
     @property
     def reach(self) -> int:
-        """Largest folded distance, in pitches, of two sites visited by one mark, rounded up."""
-        out = 0.0
-        for (p, r), (turn, other_turn) in zip(
-            product(self.shifts, repeat=2), product(self.phases, repeat=2), strict=True
-        ):
-            (a, b), (c, d) = (p.real, p.imag), (r.real, r.imag)
-            out = max(
-                out,
-                max(abs(a - c), abs(b - d))
-                if turn == other_turn
-                else max(abs(a), abs(b)) + max(abs(c), abs(d)),
-            )
-        return ceil(out)
+        """Largest distance, in pitches, of two sites visited by one mark, rounded up.
+
+        Each turned back as its view turns the mark.
+        """
+        turned_back = self.phases.conj() * self.shifts
+        apart = turned_back[:, None] - turned_back
+        return ceil(max(abs(apart.real).max(initial=0), abs(apart.imag).max(initial=0)))
 
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
         """Return the m and n of a mark by its index."""

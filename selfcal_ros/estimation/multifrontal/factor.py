@@ -14,9 +14,8 @@ leaves a factor i^g. The few sites that such readings touch are the cut: each ge
 every g, and copies are joined by i^g h(X) at the very end. All the rest of the elimination is real
 (method eq. 8.1).
 
-A mark joins only sites that quarter turns and small shifts carry into each other. Folded into
-one eighth of the plane, (max(|i|, |j|), min(|i|, |j|)), such sites are neighbours, so straight
-cuts through the folded field separate the matrix.
+A mark joins only sites that quarter turns and small shifts carry into each other. In the quadrant
+such sites are neighbours, so straight cuts through it separate the matrix.
 """
 
 from collections.abc import Iterator
@@ -31,6 +30,7 @@ import numpy  # noqa: F401  (its library must be loaded before it can be found)
 import numpy as np
 import scipy.linalg  # noqa: F401  (so must scipy's own)
 from scipy.linalg import blas, lapack
+from scipy.sparse import coo_matrix
 from threadpoolctl import ThreadpoolController
 
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
@@ -38,17 +38,12 @@ from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 
 @dataclass(frozen=True, eq=False)
 class RealSymmetricForm:
-    """The matrix M = P^H R P over the sites, with R real.
+    """What makes the matrix M = P^H R P over the sites of R, which is real.
+
+    R is over the free sites and the copies of the cut sites.
 
     Attributes
     ----------
-    rows, columns : int array (entries,)
-        Variables joined by an entry of R: the free sites, then the copies of the cut sites. R is
-        symmetric, an entry may be in either triangle; duplicate entries are summed.
-    values : float array (entries,)
-        The entries.
-    size : int
-        Number of variables.
     free, cut : int array
         Sites without and with copies.
     copy_of : int array (copies,)
@@ -65,10 +60,6 @@ class RealSymmetricForm:
         Its share in the mean of its mark.
     """
 
-    rows: np.ndarray
-    columns: np.ndarray
-    values: np.ndarray
-    size: int
     free: np.ndarray
     cut: np.ndarray
     copy_of: np.ndarray
@@ -84,8 +75,10 @@ def fold(
     weight: np.ndarray,
     relative_weight: np.ndarray,
     pins: np.ndarray,
-) -> RealSymmetricForm:
-    """Return the folded matrix of weighted readings.
+) -> tuple[coo_matrix, RealSymmetricForm]:
+    """Return the folded matrix of weighted readings: R, and what makes M of it.
+
+    R is symmetric: an entry may be in either triangle, those of one place are summed.
 
     Parameters
     ----------
@@ -117,13 +110,14 @@ def fold(
     variable = place[index]
     variable[on_cut] = len(free) + copies
     mean = weight.sum() / max(np.count_nonzero(read), 1)
-    size = len(free) + len(keys)
     diagonal = np.bincount(
-        variable.ravel(), (weight * (1 - relative_weight)).ravel(), minlength=size
+        variable.ravel(),
+        (weight * (1 - relative_weight)).ravel(),
+        minlength=len(free) + len(keys),
     )
     pinned = place[pins[~is_cut[pins]]]
     diagonal[pinned] += mean
-    entries = _entries(
+    matrix = _real_matrix(
         variable,
         diagonal,
         weight.reshape(read.shape),
@@ -131,9 +125,7 @@ def fold(
     )
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
-    return RealSymmetricForm(
-        *entries,
-        size=size,
+    return matrix, RealSymmetricForm(
         free=free,
         cut=cut,
         copy_of=keys // 4,
@@ -155,13 +147,13 @@ def _quadrants(shape: tuple[int, int]) -> np.ndarray:
     return out
 
 
-def _entries(
+def _real_matrix(
     variable: np.ndarray,
     diagonal: np.ndarray,
     weight: np.ndarray,
     relative_weight: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, columns and values of one triangle of R."""
+) -> coo_matrix:
+    """Return R, one triangle of it."""
     rows = [np.arange(len(diagonal))]
     values = [diagonal]
     columns = rows.copy()
@@ -173,10 +165,11 @@ def _entries(
         columns.append(b)
         # an entry and its mirror image may coincide on the diagonal
         values.append(np.where(a == b, 2 * value, value))
-    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+    at = np.concatenate(rows), np.concatenate(columns)
+    return coo_matrix((np.concatenate(values), at), shape=(len(diagonal),) * 2)
 
 
-LEAF = 192
+LEAF = 96
 """Number of sites below which a part of the field is not cut further."""
 
 
@@ -204,27 +197,30 @@ class Front:
     offset: int
 
     @property
+    def n_own(self) -> int:
+        """Number of variables eliminated here."""
+        return self.stop - self.start
+
+    @property
     def size(self) -> int:
         """Number of values stored by the front."""
-        n_own = self.stop - self.start
-        return n_own * (n_own + len(self.boundary))
+        return self.n_own * (self.n_own + len(self.boundary))
 
     def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return views of the blocks (own, own) and (b, own), by columns."""
-        n_own = self.stop - self.start
-        middle = self.offset + (self.stop - self.start) ** 2
+        n_own, middle = self.n_own, self.offset + self.n_own**2
+        below = storage[middle : self.offset + self.size]
         return (
             storage[self.offset : middle].reshape(n_own, n_own).T,
-            storage[middle : self.offset + self.size].reshape(n_own, -1).T,
+            below.reshape(n_own, len(self.boundary)).T,
         )
 
     def places(self, variables: np.ndarray) -> np.ndarray:
         """Return the positions of variables in this front: its own first, then its boundary."""
-        n_own = self.stop - self.start
         return np.where(
             variables < self.stop,
             variables - self.start,
-            n_own + np.searchsorted(self.boundary, variables),
+            self.n_own + np.searchsorted(self.boundary, variables),
         )
 
 
@@ -234,68 +230,56 @@ class Dissection:
 
     Attributes
     ----------
-    order : int array (free,)
-        Variable eliminated at each position; the copies of the cut follow in their order.
+    order : int array (variables,)
+        Variable eliminated at each position; the copies of the cut come last, in their order.
     fronts : tuple of Front
-        In elimination order.
-    top : tuple of int
-        Fronts without a parent: only copies are left on their boundaries.
+        In elimination order; the last has the copies.
     storage : float array
         The lower triangle of the matrix, laid out for the fronts.
-    rest : float array (copies, copies)
-        The lower triangle over the copies, by columns.
     """
 
     order: np.ndarray
     fronts: tuple[Front, ...]
-    top: tuple[int, ...]
     storage: np.ndarray
-    rest: np.ndarray
 
 
 def dissect(
-    folded: RealSymmetricForm, shape: tuple[int, int], reach: int
+    matrix: coo_matrix, folded: RealSymmetricForm, shape: tuple[int, int], reach: int
 ) -> Dissection:
     """Return the nested dissection of a matrix over sites of a field.
 
     Parameters
     ----------
-    folded : RealSymmetricForm
-        The matrix; copies are not eliminated here.
+    matrix, folded
+        What `fold` returns.
     shape : tuple of int
         Sites along x and y.
     reach : int
-        Largest folded distance of two sites joined by the matrix.
+        Largest distance in the quadrant of two sites joined by the matrix.
     """
-    # |x| and |y|, rounded down to whole pitches
-    i, j = (
-        abs(2 * at - size + 1) // 2
-        for at, size in zip(np.divmod(folded.free, shape[1]), shape, strict=True)
-    )
-    far, near = np.maximum(i, j), np.minimum(i, j)
+    x, y = np.divmod(folded.free, shape[1])
+    twice = (2 * x - shape[0] + 1) + 1j * (2 * y - shape[1] + 1)
+    twice *= folded.phase[folded.free].conj()
+    # places in the quadrant, rounded down to whole pitches
+    at = np.stack([twice.real, twice.imag]).astype(int) // 2
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
     # consecutive: the variables of a front are contiguous in memory
-    rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
-    top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
-    order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
+    rows = np.argsort(at[0] * max(shape) + at[1], kind="stable")
+    top = _cut(rows, at, max(reach, 1), pieces)
+    size = matrix.shape[0]
+    pieces.append((np.arange(len(folded.free), size), top))
+    order = np.concatenate([piece for piece, _ in pieces])
 
-    n = len(order)
-    size = folded.size
-    position = np.arange(size)
-    position[order] = np.arange(n)
-    a, b = position[folded.rows], position[folded.columns]
+    position = np.empty(size, dtype=int)
+    position[order] = np.arange(size)
+    a, b = position[matrix.row], position[matrix.col]
     row, column = np.maximum(a, b), np.minimum(a, b)
-    inner = column < n
-    lengths = [len(piece) for piece, _ in pieces]
-    front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
-    fronts = _fronts(pieces, row[inner], front, size=size)
+    front = np.repeat(np.arange(len(pieces)), [len(piece) for piece, _ in pieces])
+    front = front[column]
+    fronts = _fronts(pieces, row, front, size=size)
+    at = _addresses(fronts, row, column, front=front, size=size)
     total = sum(piece_front.size for piece_front in fronts)
-    at = total + (column - n) * (size - n) + row - n
-    at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
-    values = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
-    return Dissection(
-        order, fronts, top, values[:total], values[total:].reshape(size - n, size - n).T
-    )
+    return Dissection(order, fronts, np.bincount(at, matrix.data, minlength=total))
 
 
 def _fronts(
@@ -331,22 +315,19 @@ def _addresses(
     size: int,
 ) -> np.ndarray:
     """Return the storage positions of entries (row, column) of the lower triangle."""
-    start = np.array([item.start for item in fronts])[front]
-    n_own = np.array([item.stop for item in fronts])[front] - start
     widths = np.array([len(item.boundary) for item in fronts])
     keys = np.concatenate(
-        [
-            np.zeros(0, dtype=int),
-            *(number * size + item.boundary for number, item in enumerate(fronts)),
-        ]
+        [number * size + item.boundary for number, item in enumerate(fronts)]
     )
     before = np.cumsum(widths) - widths
     place = np.searchsorted(keys, front * size + row) - before[front]
-    offset = np.array([item.offset for item in fronts])[front]
-    column = column - start
+    start, n_own, offset = np.array(
+        [(item.start, item.n_own, item.offset) for item in fronts]
+    ).T[:, front]
+    row, column = row - start, column - start
     return offset + np.where(
-        row < start + n_own,
-        column * n_own + row - start,
+        row < n_own,
+        column * n_own + row,
         n_own * n_own + column * widths[front] + place,
     )
 
@@ -393,12 +374,12 @@ class Factor:
 
     Parameters
     ----------
-    folded : RealSymmetricForm
-        The matrix.
+    matrix, folded
+        What `fold` returns.
     shape : tuple of int
         Sites along x and y.
     reach : int
-        Largest folded distance of two sites joined by the matrix.
+        Largest distance in the quadrant of two sites joined by the matrix.
 
     Raises
     ------
@@ -407,41 +388,46 @@ class Factor:
     """
 
     def __init__(
-        self, folded: RealSymmetricForm, shape: tuple[int, int], reach: int
+        self,
+        matrix: coo_matrix,
+        folded: RealSymmetricForm,
+        shape: tuple[int, int],
+        reach: int,
     ) -> None:
         self.folded = folded
-        self.dissection = dissect(folded, shape, reach)
-        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
+        self.dissection = dissect(matrix, folded, shape, reach)
+        *fronts, copies = self.dissection.fronts
+        self._sites = folded.free[self.dissection.order[: copies.start]]
+        """Site eliminated at each position, but for the copies."""
+        self._factored: list[tuple[Front, np.ndarray, np.ndarray]] = []
         updates: dict[int, np.ndarray] = {}
-        for number, front in enumerate(self.dissection.fronts):
-            f11, f21 = front.blocks(self.dissection.storage)
-            f22 = np.zeros((len(f21), len(f21)), order="F")
-            for child in front.children:
-                boundary = self.dissection.fronts[child].boundary
-                _extend((f11, f21, f22), front.places(boundary), updates.pop(child))
-            inverse, below, updates[number] = _eliminate(f11, f21, f22)
-            self._blocks.append((inverse, below))
-        self._cut_inverse = self._close(updates)
+        for number, front in enumerate(fronts):
+            blocks = self._assembled(front, updates)
+            inverse, below, updates[number] = _eliminate(*blocks)
+            self._factored.append((front, inverse, below))
+        self._cut_inverse = self._close(self._assembled(copies, updates)[0])
 
-    @property
-    def _n_free(self) -> int:
-        return len(self.folded.free)
+    def _assembled(
+        self, front: Front, updates: dict[int, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return F11, F21 and F22 of a front; the updates of its children are taken out."""
+        f11, f21 = front.blocks(self.dissection.storage)
+        f22 = np.zeros((len(f21), len(f21)), order="F")
+        for child in front.children:
+            places = front.places(self.dissection.fronts[child].boundary)
+            _extend((f11, f21, f22), places, updates.pop(child))
+        return f11, f21, f22
 
-    def _close(self, updates: dict[int, np.ndarray]) -> np.ndarray:
-        """Join the copies of the cut sites and invert the remainder, complex (cut, cut)."""
+    def _close(self, lower: np.ndarray) -> np.ndarray:
+        """Join the copies of the cut sites and invert what is left, complex (cut, cut)."""
         folded = self.folded
-        remainder = self.dissection.rest
-        for number in self.dissection.top:
-            places = self.dissection.fronts[number].boundary - self._n_free
-            _extend((remainder,), places, updates.pop(number))
-        remainder = _mirrored(np.tril(remainder))
-        size = len(folded.cut)
-        joined = np.zeros((len(remainder), size), dtype=complex)
+        if not len(folded.cut):
+            return np.zeros((0, 0), dtype=complex)
+        remainder = _mirrored(np.tril(lower))
+        joined = np.zeros((len(remainder), len(folded.cut)), dtype=complex)
         joined[np.arange(len(remainder)), folded.copy_of] = folded.copy_phase
         closed = joined.conj().T @ (remainder @ joined)
-        closed[np.diag_indices(size)] += folded.pins
-        if not size:
-            return closed
+        closed[np.diag_indices(len(closed))] += folded.pins
         lower, info = lapack.zpotrf(closed, lower=1)
         if info:
             raise np.linalg.LinAlgError("the normal matrix is not positive definite")
@@ -449,13 +435,13 @@ class Factor:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution for one or more right-hand sides, (sites,) or (sites, k)."""
-        folded, n = self.folded, self._n_free
+        folded, n = self.folded, len(self._sites)
         work, closed = self._eliminated(right.reshape(len(right), -1))
         closed = self._cut_inverse @ closed
         work[n:] = folded.copy_phase[:, None] * closed[folded.copy_of]
         self._backward(work)
         out = np.empty((len(right), work.shape[1]), dtype=complex)
-        out[folded.free[self.dissection.order]] = work[:n]
+        out[self._sites] = work[:n]
         out[folded.cut] = closed
         out *= folded.phase[:, None]
         return out.reshape(right.shape)
@@ -466,15 +452,15 @@ class Factor:
         With M = P^H L L^H P these are the products of L^-1 P: no back substitution.
         """
         work, closed = self._eliminated(right)
-        free = work[: self._n_free]
+        free = work[: len(self._sites)]
         return free.conj().T @ free + closed.conj().T @ (self._cut_inverse @ closed)
 
     def _eliminated(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns (sites, k) after elimination: for all variables, and for the cut sites."""
-        folded, n = self.folded, self._n_free
+        folded, n = self.folded, len(self._sites)
         turned = folded.phase.conj()[:, None] * columns
-        work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
-        work[:n] = turned[folded.free[self.dissection.order]]
+        work = np.zeros((len(self.dissection.order), turned.shape[1]), dtype=complex)
+        work[:n] = turned[self._sites]
         self._forward(work)
         closed = turned[folded.cut]
         np.add.at(closed, folded.copy_of, folded.copy_phase.conj()[:, None] * work[n:])
@@ -482,9 +468,7 @@ class Factor:
 
     def _forward(self, work: np.ndarray) -> None:
         real = work.view(float)
-        for front, (inverse, below) in zip(
-            self.dissection.fronts, self._blocks, strict=True
-        ):
+        for front, inverse, below in self._factored:
             values = inverse @ real[front.start : front.stop]
             real[front.start : front.stop] = values
             if len(below):
@@ -492,9 +476,7 @@ class Factor:
 
     def _backward(self, work: np.ndarray) -> None:
         real = work.view(float)
-        for front, (inverse, below) in zip(
-            reversed(self.dissection.fronts), reversed(self._blocks), strict=True
-        ):
+        for front, inverse, below in reversed(self._factored):
             values = real[front.start : front.stop]
             if len(below):
                 values = values - below.T @ real[front.boundary]
@@ -508,58 +490,38 @@ class Factor:
         eliminated.
         """
         folded = self.folded
-        fronts = self.dissection.fronts
-        n = self._n_free
-        sites = folded.free[self.dissection.order]
-        place = np.arange(folded.size)
-        place[self.dissection.order] = np.arange(n)
+        order, fronts = self.dissection.order, self.dissection.fronts
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
         place = place[folded.of_reading]
         shares = folded.shares
-        first = np.where(shares > 0, place, folded.size).min(axis=0)
+        first = np.where(shares > 0, place, len(order)).min(axis=0)
         place = np.where(shares > 0, place, first)
         marks = np.argsort(first, kind="stable")
         after = first[marks]
 
-        def of_means(z: np.ndarray, mine: np.ndarray, at: np.ndarray) -> np.ndarray:
-            return np.einsum(
-                "vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at]
-            )
-
         of_sites = np.empty(len(folded.phase))
-        means = np.zeros(len(marks))
         of_sites[folded.cut] = self._cut_inverse.diagonal().real
+        of_means = np.zeros(len(marks))
         copies = self._cut_inverse[folded.copy_of[:, None], folded.copy_of]
         copies = (folded.copy_phase[:, None] * copies * folded.copy_phase.conj()).real
-        mine = marks[(after >= n) & (after < folded.size)]
-        means[mine] = of_means(copies, mine, place[:, mine] - n)
-        needed = {}
-        for number in self.dissection.top:
-            places = fronts[number].boundary - n
-            needed[number] = copies[places[:, None], places]
-        for number in range(len(fronts) - 1, -1, -1):
-            front = fronts[number]
-            z = self._selected(number, needed.pop(number))
-            of_sites[sites[front.start : front.stop]] = z.diagonal()[
-                : front.stop - front.start
-            ]
+        known = {len(fronts) - 1: copies}
+        for number, front in reversed(list(enumerate(fronts))):
+            z = known.pop(number)
+            if front is not fronts[-1]:
+                z = _selected(*self._factored[number][1:], z)
+                sites = self._sites[front.start : front.stop]
+                of_sites[sites] = z.diagonal()[: front.n_own]
             mine = marks[slice(*np.searchsorted(after, (front.start, front.stop)))]
-            means[mine] = of_means(z, mine, front.places(place[:, mine]))
+            at = front.places(place[:, mine])
+            of_means[mine] = np.einsum(
+                "vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at]
+            )
             for child in front.children:
                 places = front.places(fronts[child].boundary)
-                needed[child] = z[places[:, None], places]
-        return of_sites, means
-
-    def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
-        """Return the inverse over one front, given the inverse over its boundary."""
-        lower, below = self._blocks[number]
-        inverse = lower.T @ lower
-        weight = lower.T @ below.T
-        n_own = len(inverse)
-        z = np.empty((n_own + len(z22),) * 2, order="F")
-        z12 = weight @ z22
-        z[n_own:, n_own:], z[:n_own, n_own:], z[n_own:, :n_own] = z22, -z12, -z12.T
-        z[:n_own, :n_own] = inverse + z12 @ weight.T
-        return z
+                known[child] = z[places[:, None], places]
+            del z  # before the next one is made
+        return of_sites, of_means
 
 
 def _mirrored(lower: np.ndarray) -> np.ndarray:
@@ -577,7 +539,7 @@ def _extend(
     Parameters
     ----------
     blocks : tuple of float arrays
-        (F11, F21, F22) of a front; or the whole matrix.
+        F11, F21 and F22 of a front.
     places : int array (b,)
         Rows and columns of the update, ascending.
     update : float array (b, b)
@@ -589,7 +551,7 @@ def _extend(
     last = slice(inner, len(places))
     to = {first: places[first], last: places[last] - n_own}
     for block, (rows, columns) in zip(
-        blocks, ((first, first), (last, first), (last, last)), strict=False
+        blocks, ((first, first), (last, first), (last, last)), strict=True
     ):
         at = to[columns][:, None] * len(block) + to[rows]
         np.add.at(block.T.reshape(-1), at.ravel(), update[rows, columns].T.ravel())
@@ -611,6 +573,17 @@ def _eliminate(
     below = blas.dtrmm(1.0, inverse, f21, side=1, lower=1, trans_a=1, overwrite_b=1)
     schur = blas.dsyrk(-1.0, below, beta=1.0, c=f22, lower=1, overwrite_c=1)
     return inverse, below, schur
+
+
+def _selected(inverse: np.ndarray, below: np.ndarray, z22: np.ndarray) -> np.ndarray:
+    """Return the inverse over one front, given the inverse over its boundary."""
+    n_own = len(inverse)
+    z = np.empty((n_own + len(z22),) * 2, order="F")
+    weight = inverse.T @ below.T
+    z12 = weight @ z22
+    z[n_own:, n_own:], z[:n_own, n_own:], z[n_own:, :n_own] = z22, -z12, -z12.T
+    z[:n_own, :n_own] = inverse.T @ inverse + z12 @ weight.T
+    return z
 
 
 _lock = RLock()

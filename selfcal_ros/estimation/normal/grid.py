@@ -47,7 +47,7 @@ class GridSystem(PlateEliminated):
         self.rotations = rotations
         self.views = LatticeViews(weight.shape[1:], poses)
 
-    @cached_property
+    @property
     def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Site, mark and quarter turns of every reading."""
         view, mark = np.nonzero(self.read.reshape(self.n_views, -1))
@@ -63,7 +63,7 @@ class GridSystem(PlateEliminated):
     def factor(self) -> Factor:
         """Factorisation of the matrix over the sites, with pins for free components."""
         folded = fold(self.views, self.weight, self.relative_weight, self.pins)
-        return Factor(folded, self.views.shape, self.views.reach)
+        return Factor(*folded, self.views.shape, self.views.reach)
 
     @property
     def variance_of_sites(self) -> np.ndarray:

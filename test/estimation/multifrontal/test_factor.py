@@ -13,6 +13,8 @@ SETS = [
     ((0, 0, 0), (2, 0, 0), (3, 1, -1)),
     ((0, 0, 0), (0, 1, 0), (0, 0, 2)),
     ((1, 0, 0), (2, 1, 0), (3, 0, 0), (0, 0, 0)),
+    ((0, 2, 0), (1, 0, 2), (3, -1, 0)),
+    ((0, 0, 0), (1, 0, 0)),
 ]
 
 
@@ -94,3 +96,11 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
     np.testing.assert_allclose(
         grid.factor.solve(right[:, 0]), (inverse @ right)[:, 0], atol=1e-9 * size
     )
+
+
+def test_the_factor_of_a_field_has_few_values_a_site():
+    """Folded into an eighth of the plane, where two sides lie on each other, it had 250."""
+    views = tuple(LatticePose(q, shift, None) for q, *shift in SETS[0])
+    weight = GridSystem(views, np.zeros((3, 61, 61))).views.in_field * 1.0
+    grid = GridSystem(views, weight)
+    assert grid.factor.dissection.storage.size < 150 * grid.n_sites
