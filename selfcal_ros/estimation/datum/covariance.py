@@ -363,9 +363,9 @@ class MapsCovariance:
         """Return the variances of a map in its datum, (2, nx, ny); NaN if unknown."""
         grid = self.system.grid
         z, known_places = grid.views.z_sites, self.system.known_sites
+        own_variance = grid.variance_of_sites  # first: it needs much memory for a while
         fields, g, a = self._datum(plate=plate)
         field, parameters, of_coefficients = self._solved(g, a)
-        own_variance = grid.variance_of_sites
         answer = grid.response
         of_terms = self.terms.fields
         if plate:

@@ -203,12 +203,20 @@ class Gauge:
 
     def __init__(self, z: np.ndarray, is_known: np.ndarray, *, scale: bool) -> None:
         self.z, self.known, self.scale = z, is_known, scale
-        self._rows = _modes(z, is_known)[: 4 if scale else 3]
-        self._gram_inverse = _inverse((self._rows.conj() @ self._rows.T).real)
+        rows = self._rows
+        self._gram_inverse = _inverse((rows.conj() @ rows.T).real)
+
+    @property
+    def _rows(self) -> np.ndarray:
+        """The modes over the known sites, complex (modes, sites)."""
+        return _modes(self.z, self.known)[: 4 if self.scale else 3]
 
     def coefficients(self, field: np.ndarray) -> np.ndarray:
         """Return the coefficients of the modes (1, i, iz, z) in `field`, (modes,)."""
-        return self._gram_inverse @ (self._rows @ field.conj().reshape(-1)).real
+        known = np.where(self.known, field, 0.0)
+        total, moment = known.sum(), np.vdot(self.z, known)
+        products = np.array([total.real, total.imag, moment.imag, moment.real])
+        return self._gram_inverse @ products[: len(self._gram_inverse)]
 
     def dual(self, mode: int) -> np.ndarray:
         """Return the row that gives one of `parts`, complex (nx, ny), real inner product."""
@@ -225,9 +233,8 @@ class Gauge:
     @cached_property
     def orthonormal(self) -> np.ndarray:
         """Orthonormal basis of the modes, complex (sites, modes), real inner product."""
-        q = np.linalg.qr(np.concatenate([self._rows.real, self._rows.imag], axis=1).T)[
-            0
-        ]
+        rows = self._rows
+        q = np.linalg.qr(np.concatenate([rows.real, rows.imag], axis=1).T)[0]
         n = self.known.size
         return q[:n] + 1j * q[n:]
 
@@ -238,12 +245,9 @@ class Gauge:
     @property
     def everywhere(self) -> np.ndarray:
         """The modes of `orthonormal` at all sites, complex (sites, modes)."""
-        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[
-            : len(self._rows)
-        ].T
-        return modes @ (
-            self._gram_inverse @ np.real(self._rows.conj() @ self.orthonormal)
-        )
+        rows = self._rows
+        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[: len(rows)].T
+        return modes @ (self._gram_inverse @ np.real(rows.conj() @ self.orthonormal))
 
     @cached_property
     def shear(self) -> np.ndarray:

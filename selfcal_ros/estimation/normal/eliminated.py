@@ -156,13 +156,12 @@ class PlateEliminated(ABC):
     def _coupling(self) -> tuple[np.ndarray, np.ndarray]:
         """Coupling of sites, (sites, p), and misalignments, (p, p), to the misalignments."""
         p = self.of_view * self.n_views
-        sites = np.zeros((self.n_sites, 0))
-        block = np.zeros((p, 0))
-        for unit in np.eye(p).reshape(self.n_views, self.of_view, p):
-            of_sites, of_views = self.adjoint(
-                self.weight * self.centred(self.misaligned(unit))
-            )
-            sites, block = np.hstack([sites, of_sites]), np.hstack([block, of_views])
+        parts = [(np.zeros((self.n_sites, 0)), np.zeros((p, 0)))]
+        parts += [
+            self.adjoint(self.weight * self.centred(self.misaligned(unit)))
+            for unit in np.eye(p).reshape(self.n_views, self.of_view, p)
+        ]
+        sites, block = (np.hstack(part) for part in zip(*parts, strict=True))
         return sites, self.tied(block)
 
     @property
@@ -177,7 +176,7 @@ class PlateEliminated(ABC):
 
     def coupled(self, fields: np.ndarray) -> np.ndarray:
         """Return the coupling of fields (sites, ...) to the misalignments, (p, ...)."""
-        return np.real(self.coupling.conj().T @ fields)
+        return np.real(fields.conj().T @ self.coupling).T
 
     @cached_property
     def response(self) -> np.ndarray:
@@ -253,7 +252,7 @@ class PlateEliminated(ABC):
             of_marks = marks.T.reshape(-1, 1, *self.weight.shape[1:])
             of_sites, misalignments = self.adjoint(self.relative_weight * of_marks)
             sites = sites - of_sites
-        return sites, -misalignments - np.real(self.response.conj().T @ sites)
+        return sites, -misalignments - np.real(sites.conj().T @ self.response).T
 
 
 def over_nodes(
