@@ -136,18 +136,15 @@ def check_existing(args: argparse.Namespace) -> None:
 
 def _refuse_ending(path: str, metavar: str) -> None:
     """Raise InputError if the name of an output ends as that of a file of another kind."""
-    expected_ending, ending = (
-        os.path.splitext(name)[1].lower() for name in (metavar, path)
-    )
-    if (
-        expected_ending in FORMATS
-        and ending in OTHERS
-        and ending not in (expected_ending, *FORMATS[expected_ending])
-    ):
+    ending = os.path.splitext(path)[1].lower()
+    expected = [os.path.splitext(name)[1] or name for name in metavar.split("|")]
+    if any(name not in FORMATS for name in expected) or ending not in OTHERS:
+        return
+    if not any(ending in (name, *FORMATS[name]) for name in expected):
         raise InputError(
             path,
             f"{metavar} is written here, which is not {ending}",
-            f"end the name in {expected_ending}",
+            f"end the name in {' or '.join(expected)}",
         )
 
 

@@ -75,6 +75,10 @@ def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
             "DCC.xml .* which is not .txt; .* .xml",
         ),
         ("solve bags/demo -o out.csv", "RESULT.json .* which is not .csv; .* .json"),
+        (
+            "step-diagonal table.csv -o out.xml",
+            "which is not .xml; end the name in .json or .csv",
+        ),
     ],
 )
 def test_the_ending_of_another_kind_is_refused(desk, capsys, words, line):
