@@ -39,7 +39,8 @@ INDEX_ENTRY = 16
 SQLITE = b"SQLite format 3"
 CONVERT = (
     "convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
-    "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]"
+    "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}], or without ROS with "
+    "`rosbags-convert --src BAG --dst NEW --dst-storage mcap`"
 )
 """Remedy for a bag with another storage."""
 

@@ -79,7 +79,7 @@ class Lines:
             if not data.strip():
                 data = b""
         raise MachineError(
-            f"no answer in {wait_s:g} s",
+            f"no answer in {wait_s:.3g} s",
             self._port,
             "check baud, dialect and the emergency stop",
         )

@@ -8,7 +8,9 @@ import yaml
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from rosbags.rosbag2 import CompressionMode, Reader
+from rosbags.convert import cli as convert
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.messages import to_model
@@ -131,6 +133,38 @@ def test_the_writer_of_rosbags(tmp_path, events, expected):
     check(next(bag.glob("*.mcap")), expected)
     with Reader(bag) as reader:
         assert reader.message_count == len(events)
+
+
+@pytest.mark.parametrize("compressed", ["none", "zstd"])
+def test_a_bag_of_sqlite_that_was_converted(
+    tmp_path, monkeypatch, events, expected, compressed
+):
+    """By the command that its refusal names."""
+    plain, old = bags.rosbags_bag(tmp_path / "plain", events), tmp_path / "old"
+    with (
+        Reader(plain) as reader,
+        RosbagsWriter(old, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer,
+    ):
+        connections = {
+            each.id: writer.add_connection(
+                each.topic,
+                each.msgtype,
+                msgdef=each.msgdef.data,
+                rihs01=each.digest,
+            )
+            for each in reader.connections
+        }
+        for each, logged_ns, data in reader.messages():
+            writer.write(connections[each.id], logged_ns, data)
+    with pytest.raises(InputError, match="rosbags-convert") as refused:
+        solved(old)
+    command = str(refused.value).split("`")[-2].split()
+    paths = {"BAG": str(old), "NEW": str(tmp_path / "new")}
+    asked = [paths.get(word, word) for word in command]
+    monkeypatch.setattr("sys.argv", [*asked, "--compress", compressed])
+    with pytest.raises(SystemExit, match="0"):
+        convert.main()
+    check(tmp_path / "new", expected)
 
 
 @pytest.mark.parametrize("metadata", [True, False])
