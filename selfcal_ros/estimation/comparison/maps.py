@@ -27,7 +27,7 @@ KINDS = {"xy": "m", "theta": "rad"}
 """The maps of a result, and their units."""
 
 DRAWS = 2000
-"""Draws of noise: fifty of them exceed the limit of the largest |z|."""
+"""Draws of noise: fifty of them, 25 of each of two maps, exceed the limit of the largest |z|."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +47,11 @@ class ReducedNoise:
     covariance: np.ndarray
     removed: np.ndarray
     dof: float
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is noise, and all of it is known."""
+        return bool(np.isfinite(self.covariance).all() and self.covariance.any())
 
     @cached_property
     def _basis(self) -> np.ndarray:
@@ -137,11 +142,16 @@ def of_one_kind(covers: Sequence[np.ndarray]) -> list[np.ndarray]:
     return list(covers) if full else [variances(cover) for cover in covers]
 
 
-def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | None:
-    """Test values (n,) without columns against their noise; None if that is unknown or none."""
-    covariance, dof = spread.covariance, spread.dof
-    if not np.isfinite(covariance).all() or not covariance.any():
+def significance(
+    values: np.ndarray, spread: ReducedNoise, *, level: float = USUAL_LEVEL
+) -> Significance | None:
+    """Test values (n,) without columns against their noise; None if that is unknown or none.
+
+    Both tests together have the `level`.
+    """
+    if not spread.is_known:
         return None
+    dof = spread.dof
     ratio = values / spread.u
     varies = spread.varies
     rank = spread.rank
@@ -150,7 +160,7 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
     p = of_square(square, rank, dof)
     largest = float(abs(ratio[varies]).max())
     drawn = abs(spread.drawn[varies]).max(axis=0) if spread.correlated else None
-    p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
+    p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof, level / 2)
     of_largest = spread.variance[np.abs(values).argmax()]
     return Significance(
         chi2_ratio=square / rank,
@@ -161,7 +171,7 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
         z_limit=limit,
         p_z=p_z,
         noise_dof=dof,
-        significant=min(p, p_z) < USUAL_LEVEL / 2,
+        significant=min(p, p_z) < level / 2,
         u_rms=float(np.sqrt(spread.variance.mean())),
         u_largest=float(np.sqrt(of_largest)),
     )
@@ -186,19 +196,23 @@ def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _of_largest(
-    largest: float, n: int, drawn: np.ndarray | None, noise_dof: float
+    largest: float,
+    n: int,
+    drawn: np.ndarray | None,
+    noise_dof: float,
+    level: float = USUAL_LEVEL / 2,
 ) -> tuple[float, float]:
-    """Return the probability of such a |z| among n values, and the limit of USUAL_LEVEL / 2.
+    """Return the probability of such a |z| among n values, and the limit of a level.
 
     The number of values bounds it (Bonferroni); the largest |z| of draws, if there are any, give it
     for correlated nodes, except in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)
     bound = min(float(2 * n * stdtr(dof, -largest)), 1.0)
-    limit = -float(stdtrit(dof, USUAL_LEVEL / 4 / n))
+    limit = -float(stdtrit(dof, level / 2 / n))
     if drawn is None:
         return bound, limit
-    above = int(USUAL_LEVEL / 2 * (len(drawn) + 1))
+    above = int(level * (len(drawn) + 1))
     p = (1 + np.count_nonzero(drawn >= largest)) / (1 + len(drawn))
     return min(bound, float(p)), min(limit, float(np.sort(drawn)[-above]))
 
@@ -218,7 +232,7 @@ class MapDifference:
     nonorthogonality, scale_difference : float
         Differences of O and R.
     xy, theta : Significance or None
-        Tests; None if there is nothing to test.
+        Tests, 5 % altogether; None if there is nothing to test.
     """
 
     dx: np.ndarray
@@ -302,6 +316,10 @@ def compare(
         _difference((a, b), pair, kind, plates=plates, scale=not keep_scale)
         for kind in KINDS
     )
+    tested = [of_map.noise.is_known for of_map in (xy, theta) if of_map.noise]
+    test_xy, test_theta = (
+        of_map.test(USUAL_LEVEL / max(sum(tested), 1)) for of_map in (xy, theta)
+    )
     o, r = (
         getattr(pair[1], name) - getattr(pair[0], name)
         for name in ("nonorthogonality", "scale_difference")
@@ -317,18 +335,25 @@ def compare(
         theta_rad=float(theta.datum[0]),
         nonorthogonality=o,
         scale_difference=r,
-        xy=xy.test,
-        theta=theta.test,
+        xy=test_xy,
+        theta=test_theta,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Difference:
-    """One map minus another, (parts, *places), the datum difference removed, and its test."""
+    """One map minus another, (parts, *places), the datum difference removed, and its noise."""
 
     values: np.ndarray
     datum: np.ndarray
-    test: Significance | None
+    noise: ReducedNoise | None
+
+    def test(self, level: float) -> Significance | None:
+        """Return the test of the known values; None if they are too few or have no noise."""
+        if self.noise is None:
+            return None
+        known_values = self.values[np.isfinite(self.values)]
+        return significance(known_values, self.noise, level=level)
 
 
 def _difference(
@@ -372,9 +397,7 @@ def _difference(
             strict=True,
         )
     )
-    return _Difference(
-        out, datum, significance(values, ReducedNoise(total, columns, dof))
-    )
+    return _Difference(out, datum, ReducedNoise(total, columns, dof))
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:

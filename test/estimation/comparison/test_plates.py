@@ -30,19 +30,36 @@ def calibrated(truth, rng):
 
 
 def test_plates_measured_twice_agree_five_times_in_hundred():
-    """On two machines, with lines: two tests of 5 %, each a little below."""
+    """On two machines, with lines: two maps that share the 5 %."""
     machines = [
         random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k))
         for k in (1, 2)
     ]
     machines[1] = replace(machines[1], a=machines[0].a, a_theta=machines[0].a_theta)
-    xy = theta = 0
+    below, differ = np.zeros(2), 0
     for seed in range(DRAWS):
         rng = np.random.default_rng(seed)
         found = compare(*(calibrated(truth, rng) for truth in machines), plates=True)
         assert found.xy.correlated and found.theta.correlated
-        xy, theta = xy + found.xy.significant, theta + found.theta.significant
-    assert 1 <= min(xy, theta) <= max(xy, theta) <= binom.ppf(0.999, DRAWS, 0.05)
+        p = np.array([min(test.p, test.p_z) for test in (found.xy, found.theta)])
+        below += p < 0.025
+        differ += found.significant
+        assert found.significant == bool(p.min() < 0.0125)
+    assert below.min() >= 1 and below.max() <= binom.ppf(0.999, DRAWS, 0.05)
+    assert differ <= binom.ppf(0.999, DRAWS, 0.05)
+
+
+def test_a_map_that_is_compared_alone_has_all_of_the_five_percent():
+    """Its limit of a node is lower than beside the map of the lines."""
+    rng = np.random.default_rng(1)
+    truth = random_truth(PLAN.artifact, len(PLAN.views), rng)
+    pair = [calibrated(truth, rng) for _ in range(2)]
+    emap = pair[1].error_map
+    none = np.full(len(emap.g_theta), np.nan)
+    alone = replace(pair[1], error_map=replace(emap, g_theta=none, u_g_theta=none))
+    both, single = (compare(pair[0], other) for other in (pair[1], alone))
+    assert single.theta is None and single.xy.p == both.xy.p
+    assert single.xy.z_limit < both.xy.z_limit
 
 
 def test_what_differs_is_found_without_motion_and_scale():
