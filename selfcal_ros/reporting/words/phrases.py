@@ -181,7 +181,11 @@ def line_text(line: BudgetLine) -> str:
             return {
                 "between runs": f"scatter of {runs} runs beyond their uncertainties",
                 "shared by all runs": "declared or assumed, the same in all runs",
-            }.get(line.component, f"uncertainties of {runs} runs, by their weights")
+            }.get(
+                line.component,
+                f"uncertainties of {runs} runs, by their weights: noise, and what is "
+                "assumed of each",
+            )
         case OfReference(kind):
             return f"relative {line.u:.3g} of the distance from the centre, by {kind}"
         case OfPlate(plate):
