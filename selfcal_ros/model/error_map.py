@@ -182,6 +182,7 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     if not all(size % 2 for size in artifact.shape):
         return np.full((4, *g_m.shape[3:]), np.nan)
     hx, hy = artifact.middle
+    # eq. 27 prints the lines as 1, 1 + K/4, ...; eq. 9 counts them from 0
     along = (
         g_m[1, hx + 1 :, hy],
         -g_m[0, hx, hy + 1 :],

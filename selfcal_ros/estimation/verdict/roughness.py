@@ -360,7 +360,7 @@ class _Further:
         )
 
     def size(self, sigma_m: float) -> float:
-        """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
+        """Return the likeliest standard deviation of the coefficients, m (method eq. 12.5)."""
         determined = self.information > GAP * self.information.max()
         values, right = self.information[determined], self.right[determined]
         least = sigma_m / np.sqrt(values.max())
