@@ -12,8 +12,10 @@ from typing import Any
 from yaml import safe_dump
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.kept import KEYS
+from selfcal_ros.model.parts import PARTS
 from selfcal_ros.model.plan_form import plan_from_dict
-from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.result import VERIFICATION, result_to_dict
 from selfcal_ros.outputs import write_text
 from selfcal_ros.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.settings.parameter import Parameter
@@ -85,7 +87,8 @@ RESULT = {
     "plan_id": "plan that was measured",
     "method": "`joint` or `law`",
     "measurement_sense": "`microscope_moves` or `plate_moves`",
-    "artifact": "the plate, as in PLAN.yaml",
+    "artifact": "the plate, as in PLAN.yaml; magnification, u_magnification: by how much the "
+    "encoders indicate it larger than nominal, m/m",
     "run_id": "stamp of the run's first command, ns",
     "verdict": "`grade` (good, enlarged, not_qualified), `qualified` (false for not_qualified), "
     "`sentence`, `reasons`, `failed` (the tests that failed, as `findings`), "
@@ -141,6 +144,17 @@ RESULT = {
     "{time_s, dx, dy, count} over the view's time",
 }
 SOMETIMES = {
+    "map": "nodes of the map where they are not the sites of the lattice, as in PLAN.yaml",
+    "recheck": "what has changed since the calibration of the plate (docs/guides/recheck.md)",
+    "verification": "what a correction did while it was on: of, sentence, better, passed, fault, "
+    "theta_fault, remains, correlation, axes, remaining (docs/guides/verify.md)",
+    "camera": "of images with several marks: scale, rotation, stretch, shear (each with u_), "
+    "degree, coefficients, cells, noise_image, noise_mark (m), and yaw of the stage {x, y (m), "
+    "yaw, u_yaw (rad), p}",
+    "images": "of images with several marks: share of the variance of a reading that they have in "
+    "common, dof_mark (null = many), and of each grid view placing and step (m, n) of its cell",
+    "first_order_added": "what unequal or correlated noise adds to the variances of O and of R, "
+    "times the square of the half width, for unit noise",
     "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "
     "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
     "(_theta; agrees is null, and agrees_theta left out, where there is no noise to test it by)",
@@ -257,6 +271,8 @@ def text(result: dict[str, Any]) -> str:
         raise SystemExit(
             f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}"
         )
+    optional = ("map", "recheck", VERIFICATION, "camera", *KEYS, *PARTS)
+    sometimes = [key for key in optional if key not in RESULT]
     lines = [
         HEAD,
         "## PLAN.yaml",
@@ -269,7 +285,7 @@ def text(result: dict[str, Any]) -> str:
         "",
         "Present only if requested, or if there is something to report:",
         "",
-        *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]),
+        *table(("key", "meaning"), described(sometimes, SOMETIMES, "RESULT.json")),
         "",
         "## Parameters of the nodes",
         "",
