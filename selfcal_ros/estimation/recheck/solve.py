@@ -829,7 +829,8 @@ def _sources(
     dof_of_plate = plate.result.noise.dof_of(quantity)
     rows: dict[str, tuple[str, float, str, float, str]] = {
         NOISE: ("A", sigma, unit, getattr(noise, f"dof_{quantity}"), "readings"),
-        PLATE: ("A", rms(u_of_plate), unit, dof_of_plate, "declared"),
+        # a combined value, of both types, from a certificate (GUM 4.3.1)
+        PLATE: ("B", rms(u_of_plate), unit, dof_of_plate, "declared"),
         TEMPERATURE: ("B", u_of_length, "m/m", inf, "declared"),
         TERMS: ("B", float("nan"), unit, inf, "default"),
     }

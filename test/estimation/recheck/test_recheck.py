@@ -496,10 +496,13 @@ def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
 
 
 def test_the_budget_of_lines_adds_up_to_their_u():
-    found = recheck(sessions()[1], linear(), known_plate(calibrated(), "r.json"))
+    before = calibrated()
+    found = recheck(sessions()[1], linear(), known_plate(before, "r.json"))
     lines = {line.component: line for line in found.budget if line.quantity == "theta"}
     noise, plate = lines["reading noise"], lines["known plate"]
     assert (noise.unit, noise.u) == ("rad", found.noise.sigma_theta)
+    assert (noise.kind, plate.kind) == ("A", "B")
+    assert plate.dof == before.noise.dof_of("theta")
     assert 0 < plate.effect_rms < noise.effect_rms
     total = sum(
         line.effect_rms**2
