@@ -15,6 +15,8 @@ from selfcal_ros.collection.samples import NO_STAMPS, GrowingColumns, GrowingTab
 
 MOST_SAMPLES = 300_000
 """Largest number of samples of a joint processed together."""
+FEW = 10
+"""Number of exposures whose samples are taken together for other times: a slow stage has many."""
 COLUMNS = {"position": "f8", "reason": "i1", "moving": "?", "first": "i8", "last": "i8"}
 """Columns of a joint for each instant: result, and the range of stamps that determines it."""
 APPROACH = {"motion": "i1", "approach": "i1"}
@@ -135,15 +137,20 @@ class Exposures:
         rests : bool array (L, Q)
             Whether it can be used for a reading.
         """
-        instants = (stamps_ns - lags_ns[:, None]).ravel()
-        ends = int(instants.min()), int(instants.max())
-        (x, x_codes), (y, y_codes) = (
-            track.between(*ends).query(instants)
-            for track in (self._tracks.x, self._tracks.y)
-        )
-        shape = len(lags_ns), len(stamps_ns)
-        rests = (x_codes | y_codes) == encoder.GOOD
-        return (x + 1j * y).reshape(shape), rests.reshape(shape)
+        place = np.zeros((len(lags_ns), len(stamps_ns)), dtype=complex)
+        rests = np.zeros(place.shape, dtype=bool)
+        for start in range(0, len(stamps_ns), FEW):
+            columns = slice(start, start + FEW)
+            instants = stamps_ns[columns] - lags_ns[:, None]
+            ends = int(instants.min()), int(instants.max())
+            (x, x_codes), (y, y_codes) = (
+                track.between(*ends).query(instants.ravel())
+                for track in (self._tracks.x, self._tracks.y)
+            )
+            good = (x_codes | y_codes) == encoder.GOOD
+            place[:, columns] = (x + 1j * y).reshape(instants.shape)
+            rests[:, columns] = good.reshape(instants.shape)
+        return place, rests
 
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Take further instants of exposure, and the encoder samples since the last call.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.exposures import Exposures
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.units import S_PER_NS
 
 AT_LEAST = 5
@@ -17,7 +18,7 @@ AT_LEAST = 5
 NEARLY_ALL = 0.9
 """Fraction of them that a lag explains."""
 LATE = 50
-"""Largest lag, in usual times between two exposures."""
+"""Largest lag, in usual times between two exposures; nor is it above `MAX_AHEAD_NS`."""
 FINE = 10
 """Lags tried in a usual time between two exposures."""
 
@@ -65,7 +66,8 @@ def lag_of(
     if not any(map(len, times)):
         return None
     step = max(int(np.median(np.concatenate(times))) // FINE, 1)
-    lags = step * np.arange(-LATE * FINE, LATE * FINE + 1)
+    most = min(LATE * FINE, MAX_AHEAD_NS // step)
+    lags = step * np.arange(-most, most + 1)
     sites = np.concatenate([view_sites for _, view_sites in views])
     known, fits = (
         np.concatenate(each, axis=1)
