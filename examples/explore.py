@@ -58,7 +58,7 @@ u_x, u_y = stage.uncertainty(x, y)
 for i in range(len(x)):
     print(
         f"at {x[i]:+.3f} {y[i]:+.3f} m: add {1e6 * (x_command[i] - x[i]):+.3f} "
-        f"{1e6 * (y_command[i] - y[i]):+.3f} µm, u {1e9 * u_x[i]:.0f} {1e9 * u_y[i]:.0f} nm"
+        f"{1e6 * (y_command[i] - y[i]):+.3f} µm, u {1e6 * u_x[i]:.3f} {1e6 * u_y[i]:.3f} µm"
     )
 
 # %% [markdown]
@@ -68,7 +68,7 @@ for i in range(len(x)):
 # %%
 difference = stage.difference(load("day_2.json"))
 print(
-    f"rms {1e9 * difference.rms_m:.0f} nm, largest {1e9 * difference.max_m:.0f} nm, "
+    f"rms {1e6 * difference.rms_m:.3f} µm, largest {1e6 * difference.max_m:.3f} µm, "
     f"significant: {difference.significant}"
 )
 
