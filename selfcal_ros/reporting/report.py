@@ -162,7 +162,7 @@ figcaption { color: var(--soft); font-size: .9rem; margin-top: .3rem; }
   figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; }
   h2 { margin: 1rem 0 .3rem; } td, th { padding-bottom: .1rem; padding-top: .1rem; }
   .figures { grid-template-columns: 1fr 1fr; gap: .8rem; } .scroll { overflow: visible; }
-  figure svg { width: 100%; height: auto; } figcaption { font-size: 8pt; }
+  figure svg { width: 100%; height: auto; max-height: 220mm; } figcaption { font-size: 8pt; }
   table.list { font-size: 8pt; } .list th, .list td { white-space: normal; min-width: 0;
     padding-right: .5rem; }
   @page { margin: 15mm; @bottom-right { content: counter(page) " / " counter(pages);

@@ -23,7 +23,12 @@ from selfcal_ros.reporting.chapters import (
     extra_sections,
     heading,
 )
-from selfcal_ros.reporting.report import report_html, write_report
+from selfcal_ros.reporting.report import (
+    page,
+    printed_page,
+    report_html,
+    write_report,
+)
 from selfcal_ros.reporting.turning import script
 from test.support.results import chapters_of, html_of, known_result, with_residuals
 
@@ -136,6 +141,15 @@ def test_a_pdf_is_the_page_printed(tmp_path, printer, monkeypatch):
     assert "<script" not in html and "<nav" not in html and "Point at" not in html
 
 
+@pytest.mark.parametrize("height", [1524, 2708])
+def test_figures_taller_than_a_page_are_printed_smaller(printer, height):
+    """As the residuals of ten views, or of all cells of images."""
+    svg = f'<svg class="figure" viewBox="0 0 480 {height}" width="480"></svg>'
+    figure = f"<figure>{svg}<figcaption>What it shows</figcaption></figure>"
+    body = f'<div class="figures">{3 * figure}</div>'
+    assert printed_page(page("tall", body), "a.pdf").startswith(b"%PDF")
+
+
 def test_a_page_for_paper_has_its_colours_in_the_figures():
     result, _ = known_result(3, 8)
     html = report_html(result, chapters_of(result), heading(result, {}), printed=True)
@@ -193,7 +207,7 @@ def test_the_sentence_comes_first_and_the_maps_before_the_tables():
 
 def test_a_row_names_its_cells_for_narrow_screens():
     html = html_of(known_result(3, 0)[0])
-    assert re.search(r'<td class="\w" data-name="degrees of freedom">\d+</td>', html)
+    assert re.search(r'<td class="\w" data-name="dof">\d+</td>', html)
 
 
 def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
