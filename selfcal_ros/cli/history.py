@@ -71,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _activate(folder: Path, path: Path) -> None:
-    path = path if path.exists() else folder / path
+    inside = folder / path
+    path = inside if inside.exists() or not path.exists() else path
     if folder.resolve() not in path.resolve().parents:
         raise InputError(str(path), f"is not in {folder}", "copy it there first")
     require_correctable(read_result(path), str(path))

@@ -132,6 +132,17 @@ def test_the_folder_stands_for_its_active_map(folder, capsys, tmp_path):
     assert (tmp_path / "old.csv").read_text() != (tmp_path / "new.csv").read_text()
 
 
+def test_a_result_of_the_folder_is_active_beside_its_original(
+    folder, tmp_path, capsys, monkeypatch
+):
+    """`solve -o a.json`, `cp a.json FOLDER`, `history FOLDER --activate a.json`."""
+    write(tmp_path / "a.json")
+    write(folder / "a.json")
+    monkeypatch.chdir(tmp_path)
+    assert main(["history", str(folder), "--activate", "a.json"]) == 0
+    assert "active (*): a.json" in capsys.readouterr().out
+
+
 def test_another_plate_is_not_compared(folder, capsys):
     write(folder / "a.json")
     other = read_result(folder / "a.json")
