@@ -6,7 +6,9 @@ On Windows nothing is locked; bags and results are worked on all the same.
 
 import contextlib
 import os
+import re
 import signal
+import textwrap
 import threading
 from collections.abc import Iterator
 from typing import TextIO
@@ -34,6 +36,46 @@ def lock(descriptor: int, *, wait: bool = False) -> None:
     """
     if LOCKS:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
+def columns_of(stream: TextIO) -> int:
+    """Return the columns of a terminal; 0 of a file, a pipe or an unknown width."""
+    try:
+        if not stream.isatty():
+            return 0
+        said = os.environ.get("COLUMNS", "")
+        return (
+            int(said) if said.isdecimal() else os.get_terminal_size(stream.fileno())[0]
+        )
+    except (OSError, ValueError):
+        return 0
+
+
+def fitted(text: str, stream: TextIO) -> str:
+    """Return text broken between words for a terminal, which would break numbers.
+
+    A line goes on below its second column, or below its beginning.
+    """
+    width = columns_of(stream)
+    if not width:
+        return text
+    return "\n".join(
+        piece for line in text.split("\n") for piece in _broken(line, width)
+    )
+
+
+def _broken(line: str, width: int) -> list[str]:
+    if len(line) <= width:
+        return [line]
+    begins = [match.end() for match in re.finditer(r"^ *|(?<=\S) {2,}", line)][:2]
+    below = begins[-1] if begins[-1] <= width // 2 else begins[0]
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=" " * below,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 class Ended(SystemExit):

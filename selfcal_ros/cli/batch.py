@@ -27,7 +27,7 @@ from selfcal_ros.applications.batch.table import (
     summary_lines,
 )
 from selfcal_ros.cli.solve import ROBUST, add_options, parameters
-from selfcal_ros.cli.terminal import add_json, late_progress, say
+from selfcal_ros.cli.terminal import add_json, late_progress, say, tell
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 from selfcal_ros.outputs import write_json, write_text
 from selfcal_ros.parallel import begin, check_workers, outcomes
@@ -164,7 +164,7 @@ def _say(record: "Record") -> None:
     if record["exit_code"]:
         line = record["message"]
         where = "" if line.startswith(record["bag"]) else f"{record['bag']}: "
-        print(printable(f"selfcal batch: {where}{line}"), file=sys.stderr)
+        tell(f"selfcal batch: {where}{line}", sys.stderr)
 
 
 def exit_code(records: Sequence["Record"]) -> int:

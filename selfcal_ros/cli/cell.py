@@ -101,7 +101,7 @@ def _try(args: argparse.Namespace) -> int:
     check_outputs([args.cell], [output])
     with (
         ended_by_signals(),
-        connected(cell, lambda line: print(line, file=aside(args))) as machine,
+        connected(cell, lambda line: tell(line, aside(args))) as machine,
     ):
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels or 0.0)
         try:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from itertools import compress
 from typing import cast
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put
+from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put, tell
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.combine import Member, combine
 from selfcal_ros.estimation.comparison.external import map_from_table
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json and args.output != STDOUT:
         put({"written": args.output, **data["combined"], "verdict": data["verdict"]})
     elif not args.json:
-        print(_text(result), file=aside(args))
+        tell(_text(result), aside(args))
     return 0
 
 

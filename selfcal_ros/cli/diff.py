@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from selfcal_ros.cli.terminal import busy, say, say_unless_qualified
+from selfcal_ros.cli.terminal import busy, say, say_unless_qualified, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.comparison.maps import (
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     datums = [result.error_map.datum_theta for result in (a, b)]
     of_theta = difference.theta is not None and not args.artifact
     if of_theta and datums[0] != datums[1] and not args.json:
-        print(
+        tell(
             f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
             "lines to the XY axes"
         )

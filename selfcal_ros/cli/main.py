@@ -38,7 +38,7 @@ from selfcal_ros.errors import (
     printable,
 )
 from selfcal_ros.plain_numbers import number_of, whole_number_of
-from selfcal_ros.portable import say_no_more
+from selfcal_ros.portable import fitted, say_no_more
 from selfcal_ros.start import hold_interrupts
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
@@ -206,7 +206,7 @@ def _refused(line: str, code: int) -> int:
     """Print a line on stderr, if somebody reads it, and return the exit code."""
     for stream, text in (
         (sys.stdout, ""),
-        (sys.stderr, _shown(line, sys.stderr) + "\n"),
+        (sys.stderr, fitted(_shown(line, sys.stderr), sys.stderr) + "\n"),
     ):
         try:
             stream.write(text)

@@ -4,13 +4,14 @@
 import argparse
 import contextlib
 import math
+import signal
 import sys
 from pathlib import Path
 from types import ModuleType
 from typing import TextIO
 
 from selfcal_ros.cli import solve, verify
-from selfcal_ros.cli.terminal import add_json, aside
+from selfcal_ros.cli.terminal import add_json, aside, tell
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.errors import InputError, NoDataError
@@ -18,10 +19,13 @@ from selfcal_ros.machine.cell import connected, read_cell
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.outputs import can_print_symbols, to_ascii
-from selfcal_ros.portable import ended_by_signals, say_no_more
+from selfcal_ros.portable import columns_of, ended_by_signals, fitted, say_no_more
 from selfcal_ros.reporting.summary.numbers import um
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import MM_PER_M
+
+LINE = 80
+"""Columns of the line of progress where those of the terminal are not known."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -88,12 +92,14 @@ def run(args: argparse.Namespace) -> int:
         kind = NoDataError if isinstance(error, NoDataError) else InputError
         remedies = filter(None, [error.remedy, resume_hint if bag.exists() else ""])
         raise kind(error.where, error.what, "; ".join(remedies)) from error
-    except (KeyboardInterrupt, SystemExit):
+    except (KeyboardInterrupt, SystemExit) as ended:
         desk.end()
         bag_state = resume_hint if bag.exists() else "nothing was measured yet"
         with contextlib.suppress(OSError):  # of a terminal that is closed
-            print(f"selfcal measure: stopped; {bag_state}", file=sys.stderr)
-        raise
+            tell(f"selfcal measure: stopped; {bag_state}", sys.stderr)
+        if isinstance(ended, SystemExit):
+            raise
+        return 128 + signal.SIGINT
     desk.end()
     sense = ["--sense", str(cell.sense)]
     if plan.verify:
@@ -185,7 +191,8 @@ class Terminal:
         """Show coverage, noise and rejections in one line."""
         line = progress_line(progress)
         if self._stream.isatty():
-            self._print(f"\r\x1b[2K{line[:100]}", end="")
+            width = columns_of(self._stream) or LINE
+            self._print(f"\r\x1b[2K{line[: width - 1]}", end="")
             self._is_open = True
         elif progress.complete:
             self.say(line)
@@ -193,7 +200,7 @@ class Terminal:
     def say(self, line: str) -> None:
         """Show a line."""
         self.end()
-        self._print(line)
+        self._print(fitted(line, self._stream))
 
     def end(self) -> None:
         """Leave the line that is overwritten."""
@@ -217,9 +224,14 @@ class Terminal:
 def progress_line(progress: ViewProgress) -> str:
     """Return how far a view is, in one line."""
     readings = progress.readings
-    parts = [f"{progress.grid_done} of {progress.grid_expected} marks"]
-    if progress.angular_expected:
-        parts.append(f"{progress.angular_done} of {progress.angular_expected} lines")
+    parts = [
+        f"{done} of {expected} {what}"
+        for done, expected, what in (
+            (progress.grid_done, progress.grid_expected, "marks"),
+            (progress.angular_done, progress.angular_expected, "lines"),
+        )
+        if expected
+    ]
     rejected = sum(readings.rejected.values())
     if rejected:
         reasons = sorted(readings.rejected.items(), key=lambda item: -item[1])

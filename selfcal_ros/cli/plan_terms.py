@@ -306,13 +306,13 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
     lines = [
         "terms: whether the readings separate them from the stage, what a term of this size",
         "does to the map if it is left out of the model, and how likely it is to be detected",
-        f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
+        f"  {'term':<13}{'model':<6}{'separable':<14}{'size':>11}  {'map rms':>10} "
         f"{'largest':>10} {'detected':>9}",
     ]
     for c in checks:
         separable = "yes" if c.determined else f"no, {_modes(c.unseen_modes)}"
         lines.append(
-            f"  {c.name:<13}{c.model or '-':<7}{separable:<17}{size_text(c):>12}"
+            f"  {c.name:<13}{c.model or '-':<6}{separable:<14}{size_text(c):>11}"
             f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
             f" {100 * c.power:7.1f} %"
         )

@@ -24,6 +24,7 @@ from selfcal_ros.cli.terminal import (
     progress_bar,
     put,
     show,
+    tell,
     warn,
 )
 from selfcal_ros.collection.inputs import rejections
@@ -290,7 +291,8 @@ def run(args: argparse.Namespace) -> int:
         show(result, args.bag, file_of(args), aside(args))
         lines += _since(result)
     lines += _budget(result) if args.budget else []
-    print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
+    if lines:
+        tell("\n".join(lines), aside(args))
     return exit_code(result)
 
 

@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TextIO
 
-from selfcal_ros.errors import ExitCode, printable, visible
+from selfcal_ros.errors import ExitCode, visible
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
+from selfcal_ros.portable import fitted
 from selfcal_ros.settings.nodes import overrides_in
 from selfcal_ros.settings.parameter import TYPED, Settings
 
@@ -112,10 +113,12 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
 def tell(text: str, stream: TextIO | None = None) -> None:
     """Print text, on stdout unless said, without control characters, as of names of files.
 
-    If the stream cannot encode µ, ° and the like, they are spelled out.
+    If the stream cannot encode µ, ° and the like, they are spelled out. A terminal gets lines that
+    fit.
     """
+    stream = stream or sys.stdout
     lines = "\n".join(visible(line) for line in text.split("\n"))
-    put_text(lines, stream or sys.stdout)
+    put_text(fitted(lines, stream), stream)
 
 
 def warn(args: argparse.Namespace, text: str) -> None:
@@ -159,16 +162,16 @@ def show(
         summary_text,
     )  # with scipy, likewise
 
-    print(
+    tell(
         summary_text(
             result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)
         ),
-        file=stream,
+        stream,
     )
     if output:
         tell(f"result: {output}", stream)
     elif stream is sys.stdout:
-        print("result: not kept; -o RESULT.json writes it", file=stream)
+        tell("result: not kept; -o RESULT.json writes it", stream)
 
 
 def exit_code(result: CalibrationResult) -> int:
@@ -184,8 +187,7 @@ def say_unless_qualified(result: CalibrationResult, who: str) -> bool:
     """Print the verdict on stderr, and return whether a result is not qualified."""
     if result.verdict.grade is Grade.GOOD:
         return False
-    line = printable(f"{who}: {result.verdict.sentence}")
-    print(line if can_print_symbols(sys.stderr) else to_ascii(line), file=sys.stderr)
+    tell(f"{who}: {result.verdict.sentence}", sys.stderr)
     return not result.verdict.qualified
 
 

@@ -4,11 +4,13 @@
 import json
 import re
 import shlex
+import subprocess
 import sys
 
 import pytest
 
 from selfcal_ros.cli.verbs import EXAMPLES
+from test.support.sources import ROOT
 from test.support.terminals import SELFCAL, in_terminal
 from tools.mistakes import desk
 
@@ -31,6 +33,8 @@ ELSEWHERE = {
 """Verbs whose example is not run here, and why."""
 SHORTER = {"plan new": " --minutes 30"}
 """What spares an example a search."""
+BAR = r"\x1b\[[\d;?]*[a-zA-Z]|\r"
+"""Ends a piece of what is drawn over."""
 ALL = """
 import json, shlex, sys
 from selfcal_ros.cli.main import main
@@ -73,3 +77,27 @@ def test_a_cell_is_brought_up_on_a_terminal_and_ends_by_its_key(tmp_path):
         )
     assert code == 0, said[-2000:]
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("solve", "bags/hu_noise", "--budget"),
+        ("plan", "check", "config/plans/hu.yaml"),
+        ("solve", "bags/hu_noise", "--sense", "plate_moves"),
+    ],
+    ids=" ".join,
+)
+def test_lines_fit_a_terminal_of_eighty_columns_and_break_no_number(words):
+    """A pipe gets each line whole."""
+    piped = subprocess.run(
+        [*SELFCAL, *words], cwd=ROOT, capture_output=True, check=False
+    )
+    code, said = in_terminal([*SELFCAL, *words], columns=80, folder=ROOT)
+    assert code == piped.returncode
+    # what a bar has drawn is removed again
+    lines = [re.split(BAR, line)[-1] for line in said.split("\r\n")]
+    assert max(map(len, lines)) <= 80
+    whole = (piped.stdout + piped.stderr).decode()
+    assert max(map(len, whole.splitlines())) > 100
+    assert " ".join(lines).split() == whole.split()

@@ -191,7 +191,8 @@ def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, cap
 """
     )
     assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 130
-    assert "stopped; nothing was measured yet" in capsys.readouterr().err
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == "selfcal measure: stopped; nothing was measured yet"
 
 
 def test_under_nohup_a_measurement_outlives_its_terminal(tmp_path, monkeypatch):

@@ -229,7 +229,7 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "1"]) == 0
     text = capsys.readouterr().out
     assert "  XY with drift: rms 0.8905   largest 1.2154\n" in text
-    assert "  drift        free   yes" in text
+    assert "  drift        free  yes" in text
     assert (
         "assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;"
         in text

@@ -476,9 +476,9 @@ def noise_section(result: CalibrationResult) -> Section:
         "one reading",
         "σ used",
         "repeats",
-        "degrees of freedom",
+        "dof",
         "residuals",
-        "degrees of freedom",
+        "dof",
         "residuals/repeats",
     )
     if not rows:
