@@ -63,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
                     "clear": drift.is_clear,
                     "limit_m": drift.limit_m,
                     "due": drift.due and drift.due.isoformat(timespec="seconds"),
+                    "checked": drift.checked.isoformat(timespec="seconds"),
+                    "too_coarse": drift.too_coarse,
                 },
             }
         ),
@@ -129,15 +131,24 @@ def _drift_text(drift: Drift | None) -> str:
     day = (
         f"{with_u(drift.per_day_m * UM_PER_M, drift.u_per_day_m * UM_PER_M)} µm a day (k=1)"
         if drift.is_clear
-        else f"none beyond its uncertainty, so below {um(drift.most_per_day_m)} a day"
+        else f"none that is clear, so below {um(drift.most_per_day_m)} a day"
     )
-    if drift.due is None:
-        return f"drift from the active map: {day}; it will not reach U"
-    return (
-        f"drift from the active map: {day}; it reaches U, {um(drift.limit_m)}, "
-        f"{'on' if drift.is_clear else 'not before'} {drift.due:%Y-%m-%d %H:%M}: the next "
-        "calibration is due then"
-    )
+    limit = f"U, {um(drift.limit_m)},"
+    if drift.too_coarse:
+        end = (
+            f"until {drift.checked:%Y-%m-%d %H:%M} a drift of {limit} may have been missed, so no "
+            "date is given: recheck with more views and repeats"
+        )
+    elif drift.due is None:
+        end = "it will not reach U"
+    elif drift.is_clear:
+        end = f"it reaches {limit} on {drift.due:%Y-%m-%d %H:%M}: calibrate by then"
+    else:
+        end = (
+            f"it does not reach {limit} before {drift.due:%Y-%m-%d %H:%M}: recheck by then, or "
+            "calibrate"
+        )
+    return f"drift from the active map: {day}; {end}"
 
 
 def _largest_m(entry: Entry) -> float:

@@ -10,6 +10,7 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
@@ -107,13 +108,68 @@ def test_without_drift_it_is_not_due_before_one_could_have_been_missed(folder, c
     write(folder / "a.json", noise_m=2e-8)
     write(folder / "b.json", day=10, noise_m=2e-8)
     assert main(["history", str(folder), "--activate", str(folder / "a.json")]) == 0
-    assert "none beyond its uncertainty" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "none that is clear" in said and "it does not reach U, " in said
     drift = told(folder, capsys)["drift"]
-    assert not drift["clear"]
+    assert not drift["clear"] and not drift["too_coarse"]
+    missed = np.hypot(drift["per_day_m"], 2 * drift["u_per_day_m"])
     days = (datetime.fromisoformat(drift["due"]) - BEGAN).total_seconds() / 86400
-    assert days == pytest.approx(
-        drift["limit_m"] / (2 * drift["u_per_day_m"]), abs=1e-3
+    assert days == pytest.approx(drift["limit_m"] / missed, abs=1e-3)
+    assert days >= 10
+
+
+def test_checks_that_are_too_coarse_for_u_give_no_date(folder, capsys):
+    write(folder / "a.json", noise_m=1e-8)
+    for day in (10, 20):
+        write(folder / f"{day}.json", day=day, noise_m=5e-8)
+    assert main(["history", str(folder), "--activate", "a.json"]) == 0
+    said = capsys.readouterr().out
+    assert "until 2026-03-21 08:00 a drift of U, " in said
+    assert "recheck with more views and repeats" in said and " due " not in said
+    drift = told(folder, capsys)["drift"]
+    assert drift["too_coarse"] and drift["due"] is None
+    assert datetime.fromisoformat(drift["checked"]) == BEGAN + timedelta(days=20)
+    write(folder / "fine.json", day=20, noise_m=1e-8)
+    drift = told(folder, capsys)["drift"]
+    assert drift["due"] >= drift["checked"]
+
+
+def test_a_coarse_check_hides_no_drift_and_none_is_due_before_it(folder, capsys):
+    write(folder / "a.json", noise_m=1e-8)
+    for day in (4, 8):
+        write(folder / f"{day}.json", day=day, bow_m=day * 2e-8, noise_m=1e-8)
+    write(folder / "coarse.json", day=12, noise_m=1e-6)
+    assert main(["history", str(folder), "--activate", "a.json"]) == 0
+    assert "calibrate by then" in capsys.readouterr().out
+    found = told(folder, capsys)
+    assert found["entries"][-1]["changed"] is False
+    assert found["drift"]["clear"]
+    assert found["drift"]["due"] == found["drift"]["checked"]
+
+
+def test_the_part_beyond_noise_has_the_u_that_it_scatters_by():
+    """Of unchanged stages two u are exceeded seldom, and u describes the scatter."""
+    truth = random_truth(ARTIFACT, 4, np.random.default_rng(1))
+    first, *later = (
+        calibrate(
+            simulate_measurements(
+                truth,
+                hu_plan(ARTIFACT),
+                np.random.default_rng(seed),
+                sigma_m=2e-8,
+                sigma_theta_rad=1e-6,
+            ),
+            Options(),
+        )
+        for seed in range(21)
     )
+    changes = [
+        compare(one, other) for one, other in zip([first, *later], later, strict=False)
+    ]
+    squares = [change.rms_m**2 - change.xy.u_rms**2 for change in changes]
+    u = np.mean([change.u_beyond_m**2 for change in changes])
+    assert np.std(squares) == pytest.approx(u, rel=0.5)
+    assert all(change.beyond_m < 2 * change.u_beyond_m for change in changes)
 
 
 def test_the_folder_stands_for_its_active_map(folder, capsys, tmp_path):

@@ -2,7 +2,6 @@
 """The calibrations of a stage in a folder: their changes, and when the next one is due."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -65,26 +64,31 @@ class Drift:
     ----------
     per_day_m, u_per_day_m : float
         Drift and its standard uncertainty, m.
+    most_per_day_m : float
+        The drift of a day if it is clear, else the largest that may have been missed, m.
     limit_m : float
         U of the active map, rms, which the drift may reach.
+    checked : datetime
+        When the stage was last compared with the active map.
     due : datetime or None
-        When the drift, or the largest that may have been missed, reaches it; None if never.
+        When the drift, or the largest that may have been missed, reaches U; None if never, or
+        if it is too coarse.
+    too_coarse : bool
+        Whether a drift of U may have been missed until `checked`.
     """
 
     per_day_m: float
     u_per_day_m: float
+    most_per_day_m: float
     limit_m: float
-    due: datetime | None
+    checked: datetime
+    due: datetime | None = None
+    too_coarse: bool = False
 
     @property
     def is_clear(self) -> bool:
         """Whether a drift is observed at all."""
         return self.per_day_m > COVERAGE * self.u_per_day_m
-
-    @property
-    def most_per_day_m(self) -> float:
-        """The drift of a day if it is clear, else the largest that may have been missed, m."""
-        return self.per_day_m if self.is_clear else COVERAGE * self.u_per_day_m
 
 
 def history(folder: Path) -> list[Entry]:
@@ -164,9 +168,12 @@ def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
     """Return the drift about the active map; None if nothing can be compared with it.
 
     The part of each rms difference beyond its u, over the time between, a line through the active
-    map by least squares.
+    map by weighted least squares. All differences contain the error of the active map, so their
+    errors count as common. A drift that is not clear is below what the best of them would have
+    shown.
     """
     days, changes, u = [], [], []
+    checked = passed = active.measured
     for entry in entries:
         days_between = (
             abs((entry.measured - active.measured).total_seconds()) / S_PER_DAY
@@ -175,18 +182,29 @@ def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
         if isinstance(change, str) or not days_between or change.xy is None:
             continue
         days.append(days_between)
-        u.append(change.xy.u_rms)
-        changes.append(math.sqrt(max(change.rms_m**2 - change.xy.u_rms**2, 0.0)))
+        u.append(change.u_beyond_m)
+        changes.append(change.beyond_m)
+        checked = max(checked, entry.measured)
+        if not change.significant:
+            passed = max(passed, entry.measured)
     if not days:
         return None
-    t = np.array(days)
-    per_day = float(t @ changes / (t @ t))
-    u_per_day = float(np.hypot.reduce(t * u) / (t @ t))
-    drift = Drift(per_day, u_per_day, active.expanded_m, None)
+    t, u_m = np.array(days), np.array(u)
+    weights = t / u_m**2 / np.sum((t / u_m) ** 2)
+    per_day = float(weights @ changes)
+    u_per_day = float(weights @ u_m)
+    missed = float(np.min(np.hypot(changes, COVERAGE * u_m) / t))
+    drift = Drift(per_day, u_per_day, missed, active.expanded_m, checked)
+    if drift.is_clear:
+        drift = replace(drift, most_per_day_m=per_day)
     if not drift.most_per_day_m:
         return drift
     try:
         due = active.measured + timedelta(days=drift.limit_m / drift.most_per_day_m)
     except OverflowError:  # thousands of years
         return drift
+    if drift.is_clear:
+        return replace(drift, due=max(due, passed))
+    if due < checked:
+        return replace(drift, too_coarse=True)
     return replace(drift, due=due)

@@ -77,6 +77,12 @@ class ReducedNoise:
         return variances(self.remaining)
 
     @property
+    def independent(self) -> float:
+        """Number of independent values whose sum of squares scatters as theirs does."""
+        squares = self.remaining**2
+        return float(self.variance.sum() ** 2 / squares.sum())
+
+    @property
     def varies(self) -> np.ndarray:
         """Values that the columns leave a variance, bool (n,)."""
         return self.variance > GAP * self.variance.max()
@@ -233,6 +239,8 @@ class MapDifference:
         Differences of O and R.
     xy, theta : Significance or None
         Tests, 5 % altogether; None if there is nothing to test.
+    u_beyond_m : float
+        Standard uncertainty of the part of `rms_m` beyond that of noise, m; NaN without a test.
     """
 
     dx: np.ndarray
@@ -246,6 +254,14 @@ class MapDifference:
     scale_difference: float
     xy: Significance | None
     theta: Significance | None
+    u_beyond_m: float = float("nan")
+
+    @property
+    def beyond_m(self) -> float:
+        """The part of `rms_m` beyond that of noise, m; NaN without a test."""
+        if self.xy is None:
+            return float("nan")
+        return float(np.sqrt(max(self.rms_m**2 - self.xy.u_rms**2, 0.0)))
 
     @property
     def significant(self) -> bool | None:
@@ -337,6 +353,7 @@ def compare(
         scale_difference=r,
         xy=test_xy,
         theta=test_theta,
+        u_beyond_m=float("nan") if test_xy is None else xy.u_beyond,
     )
 
 
@@ -354,6 +371,17 @@ class _Difference:
             return None
         known_values = self.values[np.isfinite(self.values)]
         return significance(known_values, self.noise, level=level)
+
+    @property
+    def u_beyond(self) -> float:
+        """Standard uncertainty of the part of the rms of the values beyond that of noise.
+
+        The mean square of noise of n values scatters by u^2 sqrt(2/n).
+        """
+        assert self.noise is not None
+        noise = self.noise
+        scatter = 2 / noise.independent + 2 / noise.dof
+        return float(np.sqrt(noise.variance.mean()) * scatter**0.25)
 
 
 def _difference(
