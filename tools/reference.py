@@ -71,6 +71,8 @@ PLAN = {
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines, at least 3; 0 or omitted without lines",
     "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
+    "artifact.marks": "a table of the marks beside the plan, id,x,y, instead of a lattice: the "
+    "other keys but angular_count are left out",
     "views[].name": "name, unique",
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",
     "views[].translation_pitch": "[a, b], nominal shift along stage x and y in pitches; "
@@ -108,8 +110,8 @@ RESULT = {
     "coverage_factor": "k for 95.45 % at those degrees of freedom: xy, theta",
     "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
     "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of the readings)",
-    "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] at x = (i − (N−1)/2) pitches and y "
-    "likewise, null where unknown; g_theta, u_g_theta: K numbers in rad; "
+    "error_map": "gx, gy, u_gx, u_gy: Nx×Ny lists in m, [i][j] at x = (i − (Nx−1)/2) pitches and "
+    "y = (j − (Ny−1)/2) pitches, null where unknown; g_theta, u_g_theta: K numbers in rad; "
     "nonorthogonality, scale_difference, datum_theta",
     "artifact_map": "ax, ay, u_ax, u_ay (m), a_theta, u_a_theta (rad) of the plate, as error_map; "
     "u_a_theta with the θ datum zero_mean, no u of the plate by Hu's law",

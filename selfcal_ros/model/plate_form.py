@@ -126,7 +126,7 @@ def artifact_of(data: dict, where: str) -> Artifact:
         _with_sides(data, where),
         where,
         {"grid_size": int, "grid_pitch": float},
-        {"angular_count": (int, 0), "grid_size_y": (int, 0)},
+        {"angular_count": (int, 0), "grid_size_y": (int, 0), "marks": (dict, {})},
     )
     return Artifact(
         raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"]

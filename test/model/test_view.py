@@ -251,6 +251,11 @@ def test_a_plate_without_angular_count_has_no_lines():
             plan_with(extra=1),
             "f: extra: unknown key; known are plan_id, artifact, views, visit",
         ),
+        (
+            plan_with(artifact={"grid_size": 5, "grid_pitch": 0.01, "missing": []}),
+            "f: artifact: missing: unknown key; known are grid_size, grid_pitch, "
+            "angular_count, grid_size_y, marks",
+        ),
         (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),
         (
             plan_with(plan_id="a\r\x1b[31m\u202e"),

@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -673,6 +674,30 @@ def result():
     )
     emap.gx[1, 2] = emap.gy[1, 2] = np.nan
     return replace(made, error_map=emap)
+
+
+def test_an_oblong_error_map_is_laid_out_as_its_comments_say():
+    made, _ = known_result(5, 8, size_y=7)
+    emap = made.error_map
+    message = through_cdr("ErrorMap", from_model.error_map(made, STAMP_NS, "f"))
+    definition = (Path(__file__).parents[3] / "msg_defs/msg/ErrorMap.msg").read_text()
+    said = (
+        "Site i*Ny + j of Nx x Ny lies at x = (i - (Nx-1)/2) grid_pitch, "
+        "y = (j - (Ny-1)/2) grid_pitch, i and j from 0: m = i - Nx//2, n = j - Ny//2."
+    )
+    assert said in definition
+    nx, ny = message.grid_size, message.grid_size_y
+    assert (nx, ny) == (5, 7) and len(message.gx) == nx * ny
+    for i in range(nx):
+        for j in range(ny):
+            assert emap.artifact.x_m[i, j] == (i - (nx - 1) / 2) * message.grid_pitch
+            assert emap.artifact.y_m[i, j] == (j - (ny - 1) / 2) * message.grid_pitch
+            assert (emap.artifact.m[i, j], emap.artifact.n[i, j]) == (
+                i - nx // 2,
+                j - ny // 2,
+            )
+            assert message.gx[i * ny + j] == emap.gx[i, j]
+            assert message.gy[i * ny + j] == emap.gy[i, j]
 
 
 def test_an_error_map_comes_back(result):
