@@ -1,17 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector on drawn images: bias, uncertainty, signs, and a named reason for each bad mark."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.simulation.rendering import Camera
-from selfcal_ros.vision.detector import MarkDetector, offset
+from selfcal_ros.vision.detector import MarkDetector, MarkFault, offset
 from selfcal_ros.vision.finding import _noise, candidates
 from selfcal_ros.vision.images import Picture
 
 PIXEL = 2e-6
+
+
+def test_every_reason_of_the_detector_is_in_its_guide():
+    page = (Path(__file__).parents[2] / "docs/start/camera.md").read_text()
+    _, _, table = page.partition("| reason | what |\n")
+    rows = table.partition("\n\n")[0]
+    assert set(re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)) == set(MarkFault)
 
 
 def camera(mark="disc", size=25.0, **more):
