@@ -154,8 +154,8 @@ def _uncertainty_line(result: CalibrationResult) -> str:
         return "uncertainty: not computed"
     u = result.error_map.u_xy
     return (
-        f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
-        f"k = {result.noise.k_xy:.3g} for 95.45 %"
+        f"standard uncertainty of the corrections at the nodes (k=1): {rms(u) * UM_PER_M:.3g} um "
+        f"rms; U: k = {result.noise.k_xy:.3g} for 95.45 %"
     )
 
 

@@ -260,7 +260,7 @@ def test_the_comment_tells_where_a_file_comes_from(name):
             "plan: demo",
             "datum: no translation",
             "reference length",
-            "standard uncertainty",
+            "standard uncertainty of the corrections at the nodes",
             "written by selfcal",
             "verdict: good",
             "2 sites were",
