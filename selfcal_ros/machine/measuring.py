@@ -334,7 +334,8 @@ class Run:
         if finding:
             return f": {finding}", ""
         return _rejected(progress), (
-            "clean the plate there, check light and focus, or leave these marks out of the plan"
+            "clean the plate there, check light and focus; a plate that lacks these marks is "
+            "a list of the others in the plan (artifact: {marks: marks.csv})"
         )
 
     def _contradiction(self, progress: ViewProgress) -> Contradiction | None:

@@ -151,8 +151,9 @@ def test_a_mark_that_is_never_seen_is_named(tmp_path):
 
     with pytest.raises(
         NoDataError, match=r"mark \(1, -1\) are not read after 3 more visits"
-    ):
+    ) as error:
         run_of(tmp_path, Dirty(machine), cell).measure()
+    assert "artifact: {marks: marks.csv}" in error.value.remedy
 
 
 def test_marks_that_were_missed_are_visited_again(tmp_path):
