@@ -309,28 +309,27 @@ def factors_of(result: CalibrationResult) -> Factors:
 
 
 def angular_terms(
-    cover: MapsCovariance, columns: TermColumns, sigma_m: float, known_lines: np.ndarray
+    cover: MapsCovariance, columns: TermColumns, sense: Sense, sigma_m: float
 ) -> dict[str, np.ndarray]:
     """Return the contribution of each term of the lines to u of the angular map, rad, (K,).
 
     Parameters
     ----------
-    cover, columns : MapsCovariance, TermColumns
-        As in `saved_terms`.
+    cover, columns, sense : MapsCovariance, TermColumns, Sense
+        As in `saved_terms`. The mean of the known lines is the datum.
     sigma_m : float
         Noise of one grid reading, m.
-    known_lines : bool array (K,)
-        Lines of the map; their mean is the datum.
     """
     u_of_terms = {}
     for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
         rows = columns.rows([name])
         turned = cover.terms.turned[:, rows]
-        turned = turned - turned[known_lines].mean(axis=0)
+        turned = turned - turned[cover.system.known_lines].mean(axis=0)
         power = np.einsum(
             "kp,pq,kq->k", turned, cover.terms.covariance[np.ix_(rows, rows)], turned
         )
-        u_of_terms[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
+        u = lines_turned_over(sense, np.sqrt(np.maximum(power, 0.0)), sign=1)
+        u_of_terms[str(name)] = rounded(u * sigma_m)
     return u_of_terms
 
 
@@ -735,7 +734,7 @@ def _error_map(
                     _beside_map(model, lines, measurements.sense),
                 ),
                 angular=angular_terms(
-                    cover, columns, fitted.xy.sigma, system.known_lines
+                    cover, columns, measurements.sense, fitted.xy.sigma
                 ),
             )
         if system.angular.n_views:

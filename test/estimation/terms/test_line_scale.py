@@ -107,9 +107,10 @@ def test_without_them_either_may_be_at_fault(spread):
     assert result.verdict.grade is Grade.ENLARGED and off(result, truth) < 1.5
 
 
-def test_where_all_plates_lie_alike_it_is_a_part_of_the_uncertainty():
+@pytest.mark.parametrize("sense", BOTH)
+def test_where_all_plates_lie_alike_it_is_a_part_of_the_uncertainty(sense):
     """A map of lines alone is as large as their offsets: 1 % of it is in U unless declared."""
-    truth, readings = measured(1.01, spread=replace(SPREAD, phi_rad=0.0))
+    truth, readings = measured(1.01, sense, spread=replace(SPREAD, phi_rad=0.0))
     result = calibrate(readings, Options())
     exact = calibrate(readings, Options(terms=parse_terms(["line_scale:0"], "")))
     assert scale_of(result).u == pytest.approx(0.01, rel=0.05)
