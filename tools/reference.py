@@ -137,8 +137,8 @@ RESULT = {
     "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
     "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
     "microscope, (r, 4), the last two times the plate's longer half width; "
-    "with_map: how many of them belong to the factors; effects_on_plate: what "
-    "effects outside the model add to the variance of the plate's map, "
+    "with_map: how many of them belong to the factors; terms: those of the others; "
+    "effects_on_plate: what effects outside the model add to the variance of the plate's map, "
     "(2, nx, ny), over σ²",
     "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
     "rad",

@@ -103,6 +103,9 @@ class Factors:
         So many of `beside` belong to the first factors of the map, the others leave it as it is.
     on_plate : float array (2, nx, ny), optional
         What effects that are not terms of the model add to the variance of the plate's map.
+    beside_terms : tuple of str
+        The term that each of those of `beside` belongs to that leave the map as it is; empty where
+        an older file does not say it.
     """
 
     terms: tuple[str, ...]
@@ -110,6 +113,7 @@ class Factors:
     beside: Mapping[str, np.ndarray] = field(default_factory=dict)
     with_map: int = 0
     on_plate: np.ndarray | None = None
+    beside_terms: tuple[str, ...] = ()
 
     @classmethod
     def none(cls, shape: tuple[int, ...]) -> "Factors":
@@ -135,7 +139,11 @@ class Factors:
         """Return the JSON form."""
         out: dict[str, Any] = {"terms": list(self.terms), "factors": plain(self.of_map)}
         if self.beside:
-            out["beside"] = {"with_map": self.with_map, **plain(dict(self.beside))}
+            out["beside"] = {
+                "with_map": self.with_map,
+                "terms": list(self.beside_terms),
+                **plain(dict(self.beside)),
+            }
         if self.on_plate is not None:
             out["effects_on_plate"] = plain(self.on_plate)
         return out
@@ -280,6 +288,7 @@ def _factors(
     shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
     quantities = dict(read(dict, fields.get("beside", {})))
     with_map = read(int, quantities.pop("with_map", 0))
+    beside_terms = read(tuple[str, ...], quantities.pop("terms", []))
     quantity_values = {}
     for name, values in quantities.items():
         quantity_values[name] = _numbers(
@@ -293,6 +302,8 @@ def _factors(
         len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))
     ):
         raise ValueError(f"{FACTORS}: quantities beside the map of other factors")
+    if beside_terms and numbers != {with_map + len(beside_terms)}:
+        raise ValueError(f"{FACTORS}: other terms than quantities beside the map")
     on_plate = fields.get("effects_on_plate")
     return Factors(
         terms,
@@ -302,6 +313,7 @@ def _factors(
         None
         if on_plate is None
         else _numbers(on_plate, (2, *of_plate), FACTORS, "no effects on the plate"),
+        beside_terms,
     )
 
 

@@ -21,6 +21,7 @@ FULL = Kept(
         },
         1,
         RNG.random((2, *PLATE)),
+        ("line_scale", "line_scale"),
     ),
     {"drift": RNG.random(LINES)},
     RNG.random(2),
@@ -35,6 +36,9 @@ def test_json_keeps_all_of_it_to_the_last_bit():
     assert found.to_dict() == data
     assert found.images == FULL.images and found.factors.terms == FULL.factors.terms
     assert found.factors.with_map == 1
+    assert found.factors.beside_terms == ("line_scale", "line_scale")
+    del data["covariance_terms"]["beside"]["terms"]  # as older files
+    assert kept_from_dict(data, MAP, PLATE, LINES).factors.beside_terms == ()
     np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
     np.testing.assert_array_equal(
         found.factors.beside["lines"], FULL.factors.beside["lines"]
@@ -115,6 +119,11 @@ def test_what_is_infinite_or_unknown_is_kept():
             ("covariance_terms", "beside", "with_map"),
             -1,
             "beside the map of other factors",
+        ),
+        (
+            ("covariance_terms", "beside", "terms"),
+            ["line_scale"],
+            "covariance_terms: other terms than quantities beside the map",
         ),
         (
             ("covariance_terms", "effects_on_plate"),

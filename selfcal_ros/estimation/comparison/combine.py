@@ -19,7 +19,11 @@ from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import BEYOND, SHOWN
-from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariances
+from selfcal_ros.estimation.comparison.covariance import (
+    behind,
+    covariance_of,
+    kept_covariances,
+)
 from selfcal_ros.estimation.comparison.maps import (
     KINDS,
     ReducedNoise,
@@ -39,7 +43,6 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     DETERMINED_BELOW,
     INTERPOLATION,
     budget_lines,
-    remaining_part,
 )
 from selfcal_ros.model.budget import BudgetLine, OfRuns
 from selfcal_ros.model.error_map import (
@@ -667,9 +670,9 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     """Return the weighted mean of several maps of one stage.
 
     Differences of datum are removed first. The weight of a run is the inverse of its mean variance
-    plus that between runs. What all runs of a machine share (the microscope as declared, and with
-    `keep_scale` the reference length, unless each run names a certificate of its own) does not
-    average out.
+    plus that between runs. What all runs of a machine share does not average out: the microscope,
+    the scale of the lines and the approach as they are declared or assumed, and with `keep_scale`
+    the reference length, unless each run names a certificate of its own.
 
     Parameters
     ----------
@@ -829,16 +832,43 @@ def _run(
 ) -> RunValues:
     values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
     result = member.result
-    factors = np.zeros((0, len(values)))
     if result is None:
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known_places)
+    of_each = np.zeros(len(values))
     if kind == "xy":
         factors = _common(result, known_places, same_length=same_length)
-    common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
+    elif (kept := behind(result)) is not None:
+        factors, of_each = kept.terms_on_lines(known_places, _shared_terms(result))
+    else:
+        factors = np.zeros((0, len(values)))
+    common = (
+        factors.T @ factors + np.diag(of_each)
+        if covariance.ndim == 2
+        else (factors**2).sum(axis=0) + of_each
+    )
     return RunValues(
         values, covariance - common, common, True, result.noise.dof_of(kind)
     )
+
+
+def _shared_terms(result: CalibrationResult) -> list[str]:
+    """Return the names of the effects of a machine that the readings of a run do not determine.
+
+    Those of terms of its model, a coefficient of which they leave, as two scales of which they show
+    the difference alone; and of effects that are assumed beside the model.
+    """
+    determined = {
+        term.name
+        for term in result.model.terms
+        if max((estimate.u for estimate in term.estimates), default=0.0)
+        < DETERMINED_BELOW * term.solved_with
+    }
+    return [
+        name
+        for name, block in blocks().items()
+        if block.shared and name not in determined
+    ]
 
 
 def _common(
@@ -846,17 +876,11 @@ def _common(
 ) -> np.ndarray:
     """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
-    Terms of the microscope that are known from elsewhere, and the same reference length.
+    Terms of the machine that are known from elsewhere, and the same reference length.
     """
-    terms = {term.name: term for term in result.model.terms}
-    names = [
-        name
-        for name, block in blocks().items()
-        if block.shared
-        if name in terms and remaining_part(terms[name]) >= DETERMINED_BELOW
-    ]
     saved = factors_of(result)
-    factors = saved.of_map[np.isin(saved.terms, names)][:, :, known_sites]
+    factors = saved.of_map[np.isin(saved.terms, _shared_terms(result))]
+    factors = factors[:, :, known_sites]
     factors = factors.reshape(len(factors), 2 * int(known_sites.sum()))
     factors = factors * np.nan_to_num(result.noise.sigma_xy)
     if same_length and result.reference is not None:

@@ -10,7 +10,7 @@ the ratio in which it enlarges that of the stage; effects that are not terms enl
 as much as the stage's, at every mark by itself.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -75,12 +75,16 @@ def covariance_of(
     factors = behind(result)
     if factors is None or not np.isfinite(u).all():
         return u**2
-    cover = (
-        factors.of_sites(known_places)
-        if kind == "xy"
-        else factors.of_lines(known_places)
-    )
-    return u**2 if cover is None else _sized(cover, u)
+    if kind == "xy":
+        cover = factors.of_sites(known_places)
+        return u**2 if cover is None else _sized(cover, u)
+    noise = factors.of_lines(known_places)
+    if noise is None:
+        return u**2
+    rows, of_each_line = factors.terms_on_lines(known_places)
+    of_terms = rows.T @ rows + np.diag(of_each_line)
+    u_noise = np.sqrt(np.maximum(u**2 - np.diag(of_terms), 0.0))
+    return _sized(noise, u_noise) + of_terms
 
 
 def unit_rows(known_sites: np.ndarray) -> np.ndarray:
@@ -417,18 +421,57 @@ class Together:
 
     def of_lines(self, known_lines: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gtheta at lines for their unit noise, None if it is not kept."""
-        result, system = self.result, self.system
-        if len(known_lines) > MAX_FULL or not system.angular.n_views:
+        if len(known_lines) > MAX_FULL or not self.system.angular.n_views:
             return None
+        rows = self._line_rows(known_lines)
+        return lines_alone(self.system).of(rows.T, np.zeros(rows.T.shape))
+
+    def _line_rows(self, known_lines: np.ndarray) -> np.ndarray:
+        """Return the functionals Gtheta, in its datum, at lines, frame of the equations, (n, K)."""
+        result = self.result
         conditions = conditions_for(
-            system,
+            self.system,
             ThetaDatum(result.error_map.datum_theta),
             Sense(result.sense),
             self.half_width_m,
         )
         to_datum = np.eye(len(known_lines)) - conditions.gain @ conditions.rows
-        rows = lines_turned_over(result.sense, to_datum)[known_lines]
-        return lines_alone(system).of(rows.T, np.zeros(rows.T.shape))
+        return lines_turned_over(result.sense, to_datum)[known_lines]
+
+    def terms_on_lines(
+        self, known_lines: np.ndarray, names: Collection[str] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return what terms and effects make of Gtheta, in its datum.
+
+        Parameters
+        ----------
+        known_lines : bool array (K,)
+            Lines.
+        names : collection of str, optional
+            Only of these, and of terms whose names an older file does not say.
+
+        Returns
+        -------
+        rows : float array (r, n)
+            Factors L of the covariance L' L, rad.
+        of_each_line : float array (n,)
+            Variance of what has no factors: with a sign of its own at each line, rad^2.
+        """
+        result, saved = self.result, self._saved
+        factors = self._saved_factors("lines", (2, len(known_lines)))[:, 0]
+        rows = self._line_rows(known_lines) @ lines_turned_over(result.sense, factors.T)
+        rows = rows.T * (np.nan_to_num(result.noise.sigma_xy) / self.half_width_m)
+        with_rows = {term.name for term in result.model.terms} if len(rows) else set()
+        if names is not None:
+            chosen = np.ones(len(rows), dtype=bool)
+            named = (*saved.terms[: saved.with_map], *saved.beside_terms)
+            chosen[: len(named)] = np.isin(named, list(names))
+            rows = rows[chosen]
+        of_each_line = np.zeros(int(known_lines.sum()))
+        for name, u in result.kept.angular.items():
+            if name not in with_rows and (names is None or name in names):
+                of_each_line += u[known_lines] ** 2
+        return rows, of_each_line
 
     def of_plate(self, kind: str, known_places: np.ndarray) -> np.ndarray | None:
         """Return the covariance of the plate's map, ``xy`` or ``theta``, None if it is not kept."""

@@ -274,7 +274,7 @@ def saved_terms(
     other_quantities = np.concatenate(
         [values.reshape(len(values), -1).T for values in other_effects.values()]
     )
-    factors, names, beside_map, beside_alone = [], [], [], []
+    factors, names, beside_map, beside_alone, names_alone = [], [], [], [], []
     for name, root in roots_by_term(cover.terms.covariance, columns):
         directions, size, right = np.linalg.svd(coordinates @ root, full_matrices=False)
         significant = size > NEGLIGIBLE
@@ -287,7 +287,9 @@ def saved_terms(
         directions, size, _ = np.linalg.svd(
             other_quantities @ (root - root @ projector), full_matrices=False
         )
-        beside_alone += list((directions * size).T[size > NEGLIGIBLE])
+        alone = (directions * size).T[size > NEGLIGIBLE]
+        beside_alone += list(alone)
+        names_alone += [name] * len(alone)
     all_of = np.array([*beside_map, *beside_alone]).reshape(-1, len(other_quantities))
     ends = np.cumsum([values[0].size for values in other_effects.values()])[:-1]
     return Factors(
@@ -300,6 +302,7 @@ def saved_terms(
                 other_effects.items(), np.split(all_of, ends, axis=1), strict=True
             )
         },
+        beside_terms=tuple(names_alone),
     )
 
 

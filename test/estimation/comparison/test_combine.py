@@ -16,6 +16,7 @@ from selfcal_ros.estimation.comparison.combine import (
     RunValues,
     _families,
     _of_run,
+    _run,
     combine,
     mean_of,
     variance_between,
@@ -23,15 +24,20 @@ from selfcal_ros.estimation.comparison.combine import (
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.uncertainty import effect_everywhere, enlarged
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.kept import Covariance, Kept
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.machine import Spread
+from selfcal_ros.simulation.machine import random_truth as random_machine
 from test.support.maps import random_map, result_of
 from test.support.options import bare
 from test.support.truth import hu_plan, random_truth, simulate_measurements
@@ -278,6 +284,103 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
     )
     u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
     np.testing.assert_allclose(found.xy.within, (u**2 - shared) / 3, rtol=0.02)
+
+
+def with_lines_seen_by(factor, terms, *, phi_rad=0.0, runs=4):
+    """Return the angles of a stage whose offsets of lines are off by a factor, and runs of it."""
+    rng, plan = np.random.default_rng(3), hu_plan(Artifact(5, 0.01, 24), 4)
+    spread = Spread(phi_rad=phi_rad, g_theta_rad=1e-3, line_factor=factor)
+    truth = random_machine(plan.artifact, len(plan.views), rng, spread)
+    settings = CellSettings(
+        Sense.PLATE_MOVES, sigma_xy_m=2e-8, sigma_theta_rad=2e-6, servo_sigma_m=5e-9
+    )
+    options = Options(causes=False, terms=parse_terms(terms, ""))
+    return truth.g_theta - truth.g_theta.mean(), [
+        part(
+            str(run),
+            calibrate(
+                simulate_measurements(truth, plan, rng, settings=settings, visits=True),
+                options,
+            ),
+        )
+        for run in range(runs)
+    ]
+
+
+def line_scales(runs):
+    """Return what the scale of the lines adds to the variance of theta, the mean over the runs."""
+    return np.mean([run.result.kept.angular["line_scale"] ** 2 for run in runs], axis=0)
+
+
+def of_theta(run):
+    return _run(run, "theta", np.isfinite(run.error_map.g_theta), same_length=False)
+
+
+def test_a_scale_of_the_lines_that_is_assumed_does_not_average_out():
+    """1.5 times what is assumed, in all runs: the mean is as far off as each of them."""
+    truth, runs = with_lines_seen_by(0.985, ["microscope:0.01"])
+    found = combine(runs)
+    emap, noise = found.result.error_map, found.result.noise
+    assert np.mean(abs(emap.g_theta - truth) < noise.k_theta * emap.u_g_theta) > 0.9
+    assert found.result.verdict.grade is Grade.GOOD
+    shared = line_scales(runs)
+    np.testing.assert_allclose(
+        found.theta.common, shared, rtol=0.01, atol=1e-3 * shared.max()
+    )
+    assert (emap.u_g_theta**2 > 0.99 * shared).all()
+    for run in runs:
+        values = of_theta(run)
+        assert np.linalg.eigvalsh(values.covariance)[0] > -1e-12 * shared.max()
+        whole = covariance_of(run.result, "theta", np.ones(24, dtype=bool))
+        np.testing.assert_allclose(
+            np.diag(whole), run.error_map.u_g_theta**2, rtol=1e-4
+        )
+
+
+def test_of_two_scales_whose_difference_alone_is_seen_either_is_shared():
+    """A plate turned by 1 mrad compares the lines with a microscope that is known to 1 %."""
+    _, runs = with_lines_seen_by(1.0, ["microscope:0.01"], phi_rad=1e-3, runs=2)
+    shared = line_scales(runs)
+    np.testing.assert_allclose(
+        combine(runs).theta.common, shared, rtol=0.05, atol=0.01 * shared.max()
+    )
+
+
+def test_a_scale_of_the_lines_that_each_run_determines_averages_out():
+    _, runs = with_lines_seen_by(0.985, ["microscope:0"], phi_rad=1e-3, runs=2)
+    found = combine(runs)
+    assert not found.theta.common.any()
+    within = np.sum([np.diag(of_theta(run).covariance) for run in runs], axis=0) / 4
+    np.testing.assert_allclose(found.theta.within, within, rtol=0.1)
+
+
+@pytest.mark.parametrize("lacking", ["names", "factors"])
+def test_lines_of_results_that_do_not_say_what_is_whose_average_no_better(lacking):
+    """Older files name no terms that leave the map as it is, and large fields keep no factors."""
+    _, runs = with_lines_seen_by(1.0, ["microscope:0.01"], runs=2)
+    named = combine(runs).theta
+    older = []
+    for run in runs:
+        kept = run.result.kept
+        factors = replace(kept.factors, beside_terms=())
+        kept = replace(kept, factors=factors if lacking == "names" else None)
+        older.append(replace(run, result=replace(run.result, kept=kept)))
+    found = combine(older).theta
+    assert found.common.sum() > 0.95 * named.common.sum()
+    assert all(
+        np.linalg.eigvalsh(of_theta(run).covariance)[0] > -1e-20 for run in older
+    )
+
+
+def test_an_assumed_approach_is_shared_by_all_runs():
+    """It is no term of the model, but adds to U what readings from one side do not determine."""
+    effect = effect_everywhere("approach", A.error_map, size_m=10e-9)
+    found = combine(thrice(enlarged(A, [effect])))
+    shared = remove_modes(effect.xy, datum_modes(ARTIFACT, scale=True)).ravel() ** 2
+    np.testing.assert_allclose(
+        found.xy.common, shared, rtol=0.05, atol=0.01 * shared.max()
+    )
+    np.testing.assert_allclose(found.xy.within, combine(thrice(A)).xy.within, rtol=0.05)
 
 
 def test_a_reference_length_is_kept_once():
