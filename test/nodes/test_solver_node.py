@@ -14,6 +14,7 @@ from visualization_msgs.msg import Marker
 
 from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.collection.inputs import Command, Phase
+from selfcal_ros.collection.reduce import with_collected
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
@@ -263,7 +264,8 @@ def test_save_map_writes_the_result_of_the_readings(solve, graph, tmp_path):
     answer = graph.call(SaveMap, "solver/save_map", path=str(path))
     assert (answer.success, answer.error_code) == (True, 0)
     assert answer.message.startswith(f"saved to {path}")
-    expected = json.loads(json.dumps(result_to_dict(worded(calibrate(measurements)))))
+    result = with_collected(calibrate(measurements), measurements.views)
+    expected = json.loads(json.dumps(result_to_dict(worded(result))))
     saved = json.loads(path.read_text())
     assert saved["provenance"].pop("created")
     expected["provenance"].pop("created")
