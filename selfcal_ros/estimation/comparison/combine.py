@@ -835,18 +835,14 @@ def _run(
     if result is None:
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known_places)
-    of_each = np.zeros(len(values))
+    is_full = covariance.ndim == 2
+    common = np.zeros_like(covariance)
     if kind == "xy":
         factors = _common(result, known_places, same_length=same_length)
+        common = factors.T @ factors if is_full else (factors**2).sum(axis=0)
     elif (kept := behind(result)) is not None:
-        factors, of_each = kept.terms_on_lines(known_places, _shared_terms(result))
-    else:
-        factors = np.zeros((0, len(values)))
-    common = (
-        factors.T @ factors + np.diag(of_each)
-        if covariance.ndim == 2
-        else (factors**2).sum(axis=0) + of_each
-    )
+        of_lines = kept.terms_on_lines(known_places, _shared_terms(result))
+        common = of_lines if is_full else np.diag(of_lines)
     return RunValues(
         values, covariance - common, common, True, result.noise.dof_of(kind)
     )

@@ -81,8 +81,7 @@ def covariance_of(
     noise = factors.of_lines(known_places)
     if noise is None:
         return u**2
-    rows, of_each_line = factors.terms_on_lines(known_places)
-    of_terms = rows.T @ rows + np.diag(of_each_line)
+    of_terms = factors.terms_on_lines(known_places)
     u_noise = np.sqrt(np.maximum(u**2 - np.diag(of_terms), 0.0))
     return _sized(noise, u_noise) + of_terms
 
@@ -440,8 +439,10 @@ class Together:
 
     def terms_on_lines(
         self, known_lines: np.ndarray, names: Collection[str] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return what terms and effects make of Gtheta, in its datum.
+    ) -> np.ndarray:
+        """Return the covariance of Gtheta, in its datum, by terms and effects, (n, n) rad^2.
+
+        What has no factors has a sign of its own at each line, as far as a Fourier map can have it.
 
         Parameters
         ----------
@@ -449,13 +450,6 @@ class Together:
             Lines.
         names : collection of str, optional
             Only of these, and of terms whose names an older file does not say.
-
-        Returns
-        -------
-        rows : float array (r, n)
-            Factors L of the covariance L' L, rad.
-        of_each_line : float array (n,)
-            Variance of what has no factors: with a sign of its own at each line, rad^2.
         """
         result, saved = self.result, self._saved
         factors = self._saved_factors("lines", (2, len(known_lines)))[:, 0]
@@ -471,7 +465,18 @@ class Together:
         for name, u in result.kept.angular.items():
             if name not in with_rows and (names is None or name in names):
                 of_each_line += u[known_lines] ** 2
-        return rows, of_each_line
+        return rows.T @ rows + self._in_map(np.diag(of_each_line), known_lines)
+
+    def _in_map(self, cover: np.ndarray, known_lines: np.ndarray) -> np.ndarray:
+        """Return the part of a covariance of lines, (n, n), that a map of harmonics can have."""
+        harmonics = self.result.plate.harmonics
+        if not harmonics:
+            return cover
+        angle = 2 * np.pi * np.flatnonzero(known_lines) / len(known_lines)
+        waves = np.multiply.outer(angle, np.arange(1, harmonics + 1))
+        basis = np.linalg.qr(np.concatenate([np.cos(waves), np.sin(waves)], axis=1))[0]
+        projector = basis @ basis.T
+        return projector @ cover @ projector
 
     def of_plate(self, kind: str, known_places: np.ndarray) -> np.ndarray | None:
         """Return the covariance of the plate's map, ``xy`` or ``theta``, None if it is not kept."""
