@@ -11,17 +11,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.apply import StageMap
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.writer import build
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import digests_of, result_to_dict
 from selfcal_ros.nodes.sessions.compensating import KEEPS_UP, CompensatingSession
 from selfcal_ros.nodes.sessions.health import Level
 from selfcal_ros.reporting.summary.numbers import summary_figures
+from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import first_order, random_map, result_of
+from test.support.placed import SIX, plate, readings
 from test.support.ports import START_NS, Hands, message, settings_of
 
 ONE, TWO = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
@@ -274,6 +278,28 @@ def test_a_map_is_interpolated_as_it_was_estimated(parameter, stated, whole, use
     desk.session.take_summary(summary_of())
     wanted = Compensator(known, method=used).correct_point(0.0033, 0.0021)
     assert tuple(desk.session.correct(NAMES, [0.0033, 0.0021, 0.0])[:2]) == wanted
+
+
+def test_u_between_nodes_is_that_of_the_file_and_has_more_from_a_message(tmp_path):
+    """A message does not say that marks were read between the nodes, so nothing is assumed."""
+    measured, _ = readings(plate(7, 5), SIX, np.random.default_rng(2))
+    result = calibrate(measured)
+    assert result.reads_between_nodes
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps(result_to_dict(worded(result))))
+    from_file = Desk(map=str(path), require_qualified=False)
+    from_message = Desk(require_qualified=False)
+    from_message.session.take_map(map_of(result.error_map, interpolation="bicubic"))
+
+    between = [0.0011], [0.0023], []
+    used = StageMap(result)
+    u_x, _ = used.uncertainty(*between[:2])
+    answers = [
+        desk.session.answer(*between, inverse=False)
+        for desk in (from_file, from_message)
+    ]
+    assert answers[0]["u_x"] == pytest.approx(u_x)
+    assert answers[1]["u_x"] > 1.01 * u_x
 
 
 def test_a_map_of_an_unknown_interpolation_is_refused(desk):
