@@ -103,7 +103,8 @@ def _at_lags(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return for each lag and detection of a view if the stage is known, and rests at its site."""
     if not len(sites):
-        return (*np.zeros((2, len(lags_ns), 0), dtype=bool),)
+        none = np.zeros((len(lags_ns), 0), dtype=bool)
+        return none, none
     place, rests = exposures.rests(stamps_ns, lags_ns)
     known = np.isfinite(place)
     return known, known & rests & ~(np.abs(place - sites) > limit_m)

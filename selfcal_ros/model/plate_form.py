@@ -126,6 +126,7 @@ def artifact_of(data: dict, where: str) -> Artifact:
         _with_sides(data, where),
         where,
         {"grid_size": int, "grid_pitch": float},
+        # marks, which are not here, are named where a key is not known
         {"angular_count": (int, 0), "grid_size_y": (int, 0), "marks": (dict, {})},
     )
     return Artifact(

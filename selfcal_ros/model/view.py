@@ -361,7 +361,7 @@ SEEN_BETWEEN = 0.05
 0 at the nodes, 8/15 evenly between them, 9/100 with one view of six between them."""
 
 
-def reads_between_nodes(views: Iterable["View"], artifact: Artifact) -> bool:
+def reads_between_nodes(views: Iterable[View], artifact: Artifact) -> bool:
     """Return whether marks are read between the nodes, along x and y, of a map that has its own.
 
     Only then residuals, and u, contain what interpolation lacks there.
@@ -370,10 +370,9 @@ def reads_between_nodes(views: Iterable["View"], artifact: Artifact) -> bool:
     if grid is None:
         return False
     sites = [
-        sub_view.on_stage(artifact).marks_in_field(artifact)[1]
-        for view in views
-        for sub_view in view.sub_views
-        if sub_view.grid
+        view.on_stage(artifact).marks_in_field(artifact)[1]
+        for view in with_sub_views(views)
+        if view.grid
     ]
     if not sites:
         return False

@@ -538,16 +538,10 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     with an unknown one the map is used linearly.
     """
     emap = result.error_map
-    grid = result.plate.map_grid
-    is_spline = (
-        grid is not None
-        and grid.interpolation is Interpolation.BICUBIC
-        and bool(emap.valid.all())
-    )
-    as_fitted = grid is not None and (
-        is_spline or grid.interpolation is Interpolation.BILINEAR
-    )
-    if as_fitted and result.reads_between_nodes:
+    is_linear = result.interpolation == Interpolation.BILINEAR
+    all_known = bool(emap.valid.all())
+    is_spline = all_known and result.interpolation == Interpolation.BICUBIC
+    if (is_linear or is_spline) and result.reads_between_nodes:
         return _interpolation("xy", 0.0, 0.0)
     errors = [
         [
