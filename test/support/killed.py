@@ -38,6 +38,9 @@ NODES = {"measurement_collector": MeasurementCollector, "solver": Solver}
 """Those that may run in the process of the test."""
 
 ATTEMPTS, IDLE_S = 5, 5.0
+LATE_S = 25.0
+"""After which a message does not come any more: one to a collector that was started again may wait
+until DDS gives up the reader that was killed, 20 s, and would be counted twice if sent again."""
 
 
 class Cell:
@@ -215,7 +218,7 @@ class Cell:
         for _ in range(ATTEMPTS):
             self.send(events, first=first)
             first, changed, before = len(events), time.monotonic(), self.told
-            while time.monotonic() < changed + IDLE_S and not self._all_told(counts):
+            while time.monotonic() < changed + LATE_S and not self._all_told(counts):
                 self.graph.executor.spin_once(timeout_sec=0.02)
                 if self.told != before:
                     before, changed = self.told, time.monotonic()
