@@ -23,6 +23,12 @@ class CellDriver(CellNode[DriverSettings]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(DriverSettings, **kwargs)
+        if self.get_parameter("use_sim_time").value:
+            raise InputError(
+                "cell_driver: use_sim_time",
+                "is set, but readings of a machine are stamped by the clock of this computer",
+                "start it without use_sim_time",
+            )
         if not self.settings.cell:
             raise InputError("cell_driver: cell", "is not set", "name a CELL.yaml")
         cell = read_cell(self.settings.cell)

@@ -12,6 +12,7 @@ from selfcal_msgs.msg import ViewCommand
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.inputs import Command, Phase
+from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
@@ -109,6 +110,12 @@ def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
     k = np.arange(8) * np.pi / 4
     turn = np.array(maps[-1].g_theta) - 2e-5 * np.sin(k)
     assert np.abs(turn - turn.mean()).max() < 1e-6
+
+
+def test_a_machine_is_not_driven_in_simulated_time(graph):
+    """Its readings have the stamps of the computer's clock; those of commands would not fit."""
+    with pytest.raises(InputError, match="start it without use_sim_time"):
+        graph.node(CellDriver, cell=str(EXAMPLES / "cell.yaml"), use_sim_time=True)
 
 
 def test_a_command_latched_anew_is_not_carried_out_again_and_abort_stops(graph):
