@@ -835,6 +835,10 @@ def _run(
     if result is None:
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known_places)
+    if result.recheck is not None:
+        # it may share any of this with the other runs, or none: nothing is taken off
+        common = covariance * _part_beside_noise(result, kind)
+        return RunValues(values, covariance, common, True, result.noise.dof_of(kind))
     is_full = covariance.ndim == 2
     common = np.zeros_like(covariance)
     if kind == "xy":
@@ -846,6 +850,19 @@ def _run(
     return RunValues(
         values, covariance - common, common, True, result.noise.dof_of(kind)
     )
+
+
+def _part_beside_noise(result: CalibrationResult, kind: str) -> float:
+    """Return the part of the variance of a recheck's map that is not noise of its own readings.
+
+    It is of the plate and of terms. What runs share is in both, and not kept apart.
+    """
+    powers = {"A": 0.0, "B": 0.0}
+    for line in result.budget:
+        if line.quantity == kind and line.component != INTERPOLATION:
+            powers[line.kind] += line.effect_rms**2
+    total = sum(powers.values())
+    return powers["B"] / total if total > 0 else 1.0
 
 
 def _shared_terms(result: CalibrationResult) -> list[str]:
