@@ -61,6 +61,7 @@ class NodeBase[S: Settings](Answering):
         self._ros_time = RosTime(self.say)
         self.alone_on: list[str] = []
         self._heard_on: dict[str, Topic] = {}
+        self._unheard = ""  # publishers whose messages are not received, as last logged
         try:
             self._take_parameters(kind)
             self.set_descriptor(
@@ -125,7 +126,10 @@ class NodeBase[S: Settings](Answering):
             if topic.qos.depth > 1:
                 self.losses.add(topic.name, event.total_count_change)
 
-        events = SubscriptionEventCallbacks(message_lost=lost)
+        # no default callbacks: one due when a subscription ends would end the process (rclpy 1644)
+        events = SubscriptionEventCallbacks(
+            message_lost=lost, use_default_callbacks=False
+        )
         return self.own(
             self.create_subscription(
                 topic.type,
@@ -199,10 +203,11 @@ class NodeBase[S: Settings](Answering):
 
     def report(self) -> None:
         """Publish the health of this node."""
-        graph = [
-            mismatched(self, self._heard_on),
-            others_publishing(self, self.alone_on),
-        ]
+        unheard = mismatched(self, self._heard_on)
+        if unheard.message not in ("", self._unheard):
+            self.say(Level.ERROR, unheard.message)
+        self._unheard = unheard.message
+        graph = [unheard, others_publishing(self, self.alone_on)]
         clock = self._ros_time.look(
             simulated=self.get_parameter("use_sim_time").value,
             now_ns=self.get_clock().now().nanoseconds,

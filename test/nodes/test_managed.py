@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.duration import Duration
+from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.lifecycle import TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
@@ -252,7 +253,7 @@ def test_whatever_a_message_does_is_counted_and_told(graph):
 
 
 @pytest.mark.usefixtures("quick_beat")
-def test_a_publisher_that_cannot_be_heard_is_named(graph):
+def test_a_publisher_that_cannot_be_heard_is_named(graph, capfd):
     node = graph.node(MeasurementCollector)
     deaf = names._qos(10, reliable=False)
     graph.hand.create_publisher(names.DETECTIONS.type, names.DETECTIONS.name, deaf)
@@ -268,6 +269,23 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
         "its name",
     )
     assert node.get_name() == "measurement_collector"
+    graph.until(lambda: len(heard) > 5, "further reports")
+    assert capfd.readouterr().err.count("no messages are received from /hand") == 1
+
+
+def test_no_event_of_a_stranger_is_due_when_a_subscription_ends(graph):
+    """One of its incompatible QoS, due at that instant, ended the node: rclpy issue 1644."""
+    node = graph.node(MeasurementCollector)
+    own = [
+        subscription
+        for subscription in node.subscriptions
+        if subscription.topic_name.removeprefix("/")
+        in {topic.name for topic in names.INPUTS}
+    ]
+    kinds = {handler.event_type for item in own for handler in item.event_handlers}
+    assert kinds == {
+        QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST,
+    }
 
 
 @pytest.mark.usefixtures("quick_beat")
