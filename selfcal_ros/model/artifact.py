@@ -199,6 +199,14 @@ class Artifact:
         )
 
     @property
+    def is_stepped(self) -> bool:
+        """Whether the map is wider than the plate, by more than one of its own nodes."""
+        return self.map_grid is not None and any(
+            field_m > reach * self.grid_pitch_m + self.map_grid.pitch_m
+            for field_m, reach in zip(self.field_half_m, self.reach, strict=True)
+        )
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Number of marks along x and y."""
         return self.grid_size, self.grid_size_y or self.grid_size

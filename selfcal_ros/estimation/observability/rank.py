@@ -100,9 +100,10 @@ def smaller(plan: Plan, size: int) -> Plan:
 
     The field keeps its proportions, on which the uncertainty of a long field depends, and sides of
     even or odd numbers, and is large enough for the plan's own shifts. A list of marks remains as
-    it is.
+    it is, and so does a plate stepped over a map that is wider: its shifts need all of it.
     """
-    if plan.artifact.marks or max(plan.artifact.shape) <= size:
+    artifact = plan.artifact
+    if artifact.marks or max(artifact.shape) <= size or artifact.is_stepped:
         return plan
     reach = [
         max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
