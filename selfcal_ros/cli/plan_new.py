@@ -15,6 +15,7 @@ from typing import Any
 from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.plan_check import (
     CHECK_MARKS,
     CHECK_OFFSET_M,
@@ -34,9 +35,9 @@ from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.files import yaml_text
 from selfcal_ros.machine.cell import PLACERS, SHIPPED, known_machines
 from selfcal_ros.machine.visiting import stops
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import DEFAULT_NODES, Artifact, MapGrid
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
+from selfcal_ros.model.plan_form import MAX_VIEWS, plan_to_dict, view_to_dict
 from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
@@ -55,6 +56,12 @@ MOST_VIEWS = 5
 """Views of marks of the longest plan; a view of the lines comes on top."""
 PLACING_MIN = {"person": 5.0, "robot": 0.5}
 """Minutes that a placing of the plate takes."""
+STEPS = (0.75, 0.5)
+"""Steps of a plate over a longer stage, as parts of the plate: what is left of it overlaps, and
+joins the views."""
+NODES_APART = 2
+"""Distance of the nodes of a map wider than the plate, in pitches: the marks beside each node are
+read in several views, so that one pass tests whether the stage is smooth enough for them."""
 PIXELS_A_MARK = 12
 """Pixels across a mark of the simulated camera."""
 OWN_KEYS = {
@@ -250,7 +257,7 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([], outputs)
     refuse_existing(outputs, force=args.force)
     with late_progress("judging plans") as progress:
-        plan = _best(answers, artifact, path.stem, lambda: progress(0, None))
+        plan, why_not = _best(answers, artifact, path.stem, lambda: progress(0, None))
         prediction = _budget(plan), _next(plan)
     texts = {
         path: yaml_text(plan_to_dict(plan)),
@@ -265,7 +272,7 @@ def run(args: argparse.Namespace) -> int:
     write_together({name: utf8(text) for name, text in texts.items()})
     say(
         args,
-        "\n".join(_text(answers, plan, prediction, outputs)),
+        "\n".join(_text(answers, plan, prediction, why_not, outputs)),
         _json(answers, plan, prediction, outputs),
     )
     return int(ExitCode.DONE)
@@ -381,8 +388,11 @@ def _image(answers: Known) -> ImageCells | None:
 
 def _best(
     answers: Known, artifact: Artifact, name: str, tick: Callable[[], None]
-) -> Plan:
-    """Return the plan of the smallest uncertainty that the time allows."""
+) -> tuple[Plan, str]:
+    """Return the plan of the smallest uncertainty that the time allows.
+
+    And where the travel is longer than the plate, but the map is not, what a wider one takes.
+    """
     like = View(
         "",
         check_marks=CHECK_MARKS,
@@ -405,6 +415,9 @@ def _best(
         tick()
         if minutes_of(answers, plans[-len(REPEATS)]) > answers.minutes:
             break
+    wider, why_not = _wider(answers, plans[0], tick)
+    if wider:
+        return min(wider, key=_u_of_reading), ""
     fitting = [plan for plan in plans if minutes_of(answers, plan) <= answers.minutes]
     if not fitting:
         raise InputError(
@@ -414,7 +427,107 @@ def _best(
             f"{_counted_visits(plans[0], answers)}",
             "give more minutes, fewer marks, or fewer seconds for a mark",
         )
-    return min(fitting, key=_u_of_reading)
+    return min(fitting, key=_u_of_reading), why_not
+
+
+def _wider(
+    answers: Known, plan: Plan, tick: Callable[[], None]
+) -> tuple[list[Plan], str]:
+    """Return the plans with maps as wide as the travel that the time allows, or why there are none.
+
+    The views of `plan` tell the plate from the stage; those of the plate stepped over the travel
+    carry the map on.
+    """
+    stepped = []
+    for step in STEPS:
+        tiles = _tiles(answers, plan, step)
+        if not tiles:
+            return [], ""
+        if len(plan.views) + len(tiles) > MAX_VIEWS:
+            break
+        artifact = replace(plan.artifact, map_grid=_nodes(plan.artifact, tiles))
+        once = replace(plan, artifact=artifact, views=(*plan.views, *tiles))
+        untested = planned_system(artifact, once.views).nodes_untested
+        # in one pass the map would not be qualified
+        stepped += [list(_repeated(once))[untested:]]
+        tick()
+    if not stepped:
+        return [], (
+            f"for a map of all of the travel the plate would be placed more than {MAX_VIEWS} "
+            "times: take a longer plate"
+        )
+    shortest = stepped[0][0]
+    fitting = []
+    for plans in stepped:
+        affordable = [
+            each for each in plans if minutes_of(answers, each) <= answers.minutes
+        ]
+        if affordable and _determines_all(affordable[0]):
+            fitting += affordable
+        tick()
+    if minutes_of(answers, shortest) <= answers.minutes:
+        return fitting, (
+            "no steps of this plate that the time allows determine a map of all of the travel: "
+            "give more minutes, or take a longer plate or one with more marks"
+        )
+    return fitting, (
+        "a map of all of the travel takes "
+        f"--minutes {math.ceil(minutes_of(answers, shortest))}: "
+        f"{_counted_visits(shortest, answers)}"
+    )
+
+
+def _determines_all(plan: Plan) -> bool:
+    checked = check_plan(plan)
+    return checked.observability.identifiable and not checked.unknown_sites
+
+
+def _tiles(answers: Known, plan: Plan, step: float) -> list[View]:
+    """Return the views of the plate stepped over the travel; none if it is hardly longer."""
+    artifact = plan.artifact
+    pitch = artifact.grid_pitch_m
+    aside = _check_offset_m(artifact)
+    places = []
+    for travel, half in zip(answers.travel, artifact.half, strict=True):
+        room = math.floor(10 * ((travel / 2 - aside) / pitch - half) + 1e-9) / 10
+        n_steps = math.ceil(room / (step * half)) if room >= 1 else 0
+        places.append(
+            [round(room * (2 * i / n_steps - 1), 1) + 0.0 for i in range(n_steps + 1)]
+            if n_steps
+            else [0.0]
+        )
+    return [
+        replace(
+            plan.views[0],
+            name=f"at{x:+g}x{y:+g}y",
+            translation_m=(x * pitch, y * pitch),
+            angular=False,
+        )
+        for y in places[1]
+        for x in places[0]
+        if (x, y) != (0, 0)
+    ]
+
+
+def _nodes(artifact: Artifact, tiles: list[View]) -> MapGrid:
+    """Return the nodes of a map of all places that the marks of stepped views reach."""
+    pitch = artifact.grid_pitch_m
+    sides = [
+        2 * (max(view.translation_m[axis] for view in tiles) / pitch + half)
+        for axis, half in enumerate(artifact.half)
+    ]
+    longer = max(sides)
+    most = max(2, min(int(longer / NODES_APART + 1e-9), DEFAULT_NODES - 1))
+
+    def beyond(cells: int) -> float:
+        """Return how far, in cells, the outermost nodes lie beyond the shorter side."""
+        shorter = cells * min(sides) / longer
+        return round(math.ceil(shorter - 1e-9) - shorter, 9)
+
+    # of nearly the largest numbers that whose cells fit the shorter side best
+    cells = min(range(most, math.ceil(0.75 * most) - 1, -1), key=beyond)
+    nx, ny = (max(3, math.ceil(cells * side / longer - 1e-9) + 1) for side in sides)
+    return MapGrid(nx, longer * pitch / cells, size_y=0 if nx == ny else ny)
 
 
 def _fewest_exposures(artifact: Artifact, like: View) -> int:
@@ -488,8 +601,13 @@ def _budget(plan: Plan) -> PlanBudget:
     )
 
 
-def _next(plan: Plan) -> tuple[View, float]:
-    """Return the further view that helps most, and by which factor it changes u."""
+def _next(plan: Plan) -> tuple[View, float] | None:
+    """Return the further view that helps most, and by which factor it changes u.
+
+    None for a map wider than the plate: to try the poses of many views would take too long.
+    """
+    if plan.artifact.map_grid:
+        return None
     now, ranked = rank_next(plan, against=_against())
     added = next(item for item in ranked if len(item.views) > len(plan.views))
     return added.views[-1], added.score.rms_xy / now.rms_xy
@@ -559,20 +677,24 @@ def _simulation(answers: Known, plan: str) -> dict[str, Any]:
 def _text(
     answers: Known,
     plan: Plan,
-    prediction: tuple[PlanBudget, tuple[View, float]],
+    prediction: tuple[PlanBudget, tuple[View, float] | None],
+    why_not: str,
     outputs: list[Path],
 ) -> Iterator[str]:
-    budget, (further, factor) = prediction
+    budget, further_view = prediction
     artifact = plan.artifact
     nx, ny = artifact.shape
     span = " x ".join(
-        f"{(count - 1) * answers.pitch * MM_PER_M:g}" for count in artifact.shape
+        f"{min(2 * half, side) * MM_PER_M:.4g}"
+        for half, side in zip(artifact.field_half_m, answers.travel, strict=True)
     )
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)
     yield (
         f"plan {plan.plan_id}: {nx} x {ny} marks, {answers.lines or 'no'} angular lines; the map "
         f"covers {span} of {travel} mm of travel"
     )
+    if why_not:
+        yield why_not
     for view in plan.views:
         kind = "" if view.grid else ", lines only"
         how_often = OFTEN.get(view.repeats, f"{view.repeats} times")
@@ -586,11 +708,13 @@ def _text(
     yield (
         f"it takes about {minutes_of(answers, plan):.0f} minutes: {_counted_visits(plan, answers)}"
     )
-    longer = minutes_of(answers, replace(plan, views=(further,)))
-    yield (
-        f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
-        f"{100 * (1 - factor):.0f} % smaller and takes {longer:.0f} minutes more"
-    )
+    if further_view:
+        further, factor = further_view
+        longer = minutes_of(answers, replace(plan, views=(further,)))
+        yield (
+            f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
+            f"{100 * (1 - factor):.0f} % smaller and takes {longer:.0f} minutes more"
+        )
     yield f"written: {', '.join(map(str, outputs))}"
     tried = "" if answers.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
     yes = " --yes" if answers.machine == "simulated" else ""
@@ -603,10 +727,10 @@ def _text(
 def _json(
     answers: Known,
     plan: Plan,
-    prediction: tuple[PlanBudget, tuple[View, float]],
+    prediction: tuple[PlanBudget, tuple[View, float] | None],
     outputs: list[Path],
 ) -> dict[str, Any]:
-    budget, (further, _) = prediction
+    budget, further_view = prediction
     theta = budget.u_rms("theta")
     return {
         "plan_id": plan.plan_id,
@@ -616,5 +740,7 @@ def _json(
         "exposures": _exposures(plan),
         "U_xy": 2 * budget.u_rms("xy"),
         "U_theta": 2 * theta if answers.lines else None,
-        "next_view": view_to_dict(further, plan.artifact),
+        "next_view": view_to_dict(further_view[0], plan.artifact)
+        if further_view
+        else None,
     }

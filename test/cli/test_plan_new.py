@@ -2,6 +2,7 @@
 """``selfcal plan new``: what it writes is accepted by all that read plans, and true."""
 
 import json
+import re
 from argparse import Namespace
 from functools import cache
 from importlib import import_module
@@ -63,6 +64,44 @@ def test_its_plan_is_checked_drawn_and_measured(options, minutes, capsys):
         3 if options is CAMERA else 1
     )
     assert all(view["rejected"] == 0 for view in result["views"])
+
+
+def test_a_short_plate_is_stepped_over_a_long_stage(capsys):
+    """The map reaches the ends of the travel, and all of it lies within its U."""
+    long = ["--travel", "100x60mm", "--marks", "5", "--pitch", "10mm"]
+    assert new(*long, "--minutes", "8", "--placing", "robot") == 0
+    said = capsys.readouterr().out
+    assert "the map covers 40 x 40 of 100 x 60 mm" in said
+    minutes = re.search(r"all of the travel takes --minutes (\d+)", said)[1]
+
+    assert new(*long, "--minutes", minutes, "--placing", "robot", "--force") == 0
+    said = capsys.readouterr().out
+    assert "the map covers 98 x 49 of 100 x 60 mm" in said
+    assert main(["plan", "check", "plan.yaml", "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["unknown_sites"] == 0 and not checked["nodes_untested"]
+    assert (
+        main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    )
+    result = json.loads(capsys.readouterr().out)
+    assert all(view["used"] and not view["rejected"] for view in result["views"])
+
+
+@pytest.mark.parametrize(
+    ("travel", "minutes", "line"),
+    [
+        ("1m", "60", "placed more than 1000 times: take a longer plate"),
+        ("59mm", "60", None),
+    ],
+    ids=["too short a plate", "hardly longer"],
+)
+def test_a_map_of_the_plate_alone_says_why(travel, minutes, line, capsys):
+    options = ["--marks", "5", "--pitch", "10mm", "--minutes", minutes]
+    if travel == "1m":
+        options[1], options[3] = "3", "1mm"
+    assert new("--travel", travel, *options) == 0
+    said = capsys.readouterr().out
+    assert line in said if line else "all of the travel" not in said
 
 
 def test_on_a_full_disk_none_of_its_files_is_left(tmp_path, monkeypatch, capsys):
