@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
@@ -674,6 +676,16 @@ def _simulation(answers: Known, plan: str) -> dict[str, Any]:
     return out
 
 
+def _read_half_m(plan: Plan) -> list[float]:
+    """Return how far to either side of the middle marks are read along x and y, m."""
+    artifact = plan.artifact
+    shifts = np.array(
+        [view.translation_m for view in plan.views if not view.rotation_rad]
+    )
+    both_sides = np.minimum(shifts.max(axis=0), -shifts.min(axis=0))
+    return list(both_sides + np.array(artifact.half) * artifact.grid_pitch_m)
+
+
 def _text(
     answers: Known,
     plan: Plan,
@@ -685,8 +697,8 @@ def _text(
     artifact = plan.artifact
     nx, ny = artifact.shape
     span = " x ".join(
-        f"{min(2 * half, side) * MM_PER_M:.4g}"
-        for half, side in zip(artifact.field_half_m, answers.travel, strict=True)
+        f"{2 * min(half, read) * MM_PER_M:.4g}"
+        for half, read in zip(artifact.field_half_m, _read_half_m(plan), strict=True)
     )
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)
     yield (

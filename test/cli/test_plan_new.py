@@ -76,7 +76,7 @@ def test_a_short_plate_is_stepped_over_a_long_stage(capsys):
 
     assert new(*long, "--minutes", minutes, "--placing", "robot", "--force") == 0
     said = capsys.readouterr().out
-    assert "the map covers 98 x 49 of 100 x 60 mm" in said
+    assert "the map covers 98 x 40 of 100 x 60 mm" in said
     assert main(["plan", "check", "plan.yaml", "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
     assert checked["unknown_sites"] == 0 and not checked["nodes_untested"]
