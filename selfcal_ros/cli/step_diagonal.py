@@ -47,6 +47,7 @@ from selfcal_ros.applications.laser.table import (
     write_table,
 )
 from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.terminal import add_json, busy, put, say, tell, warn
 from selfcal_ros.compensation.frame import MachineFrame
@@ -448,6 +449,7 @@ def measurement_from_bag(
     InputError
         If a topic is missing, an option is not a valid number, or the bag cannot be used.
     """
+    BagReader(Path(args.data))  # says first what is not a bag
     for option, value in (
         ("--laser-topic", args.laser_topic),
         ("--position-topic", args.position_topic),

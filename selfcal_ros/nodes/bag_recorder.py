@@ -29,10 +29,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
         topics = [*names.INPUTS, *(names.RESULTS if self.settings.all_topics else ())]
         for topic in topics:
             name, heard = kept_names(self, topic)
-            typename = (
-                f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
-            )
-            self._writer.add_topic(name, typename, [offered(topic)], heard)
+            self._writer.add_topic(name, topic.type_name, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
         MatchedInput(

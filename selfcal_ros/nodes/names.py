@@ -36,6 +36,12 @@ class Topic:
     type: type
     qos: QoSProfile
 
+    @property
+    def type_name(self) -> str:
+        """The message type as ROS writes it, e.g. sensor_msgs/msg/JointState."""
+        package = self.type.__module__.split(".")[0]
+        return f"{package}/msg/{self.type.__name__}"
+
 
 def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
     return QoSProfile(
@@ -121,10 +127,16 @@ COMMANDED = (MOTION, CORRECTED_MOTION)
 
 
 def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
-    """Name the publishers whose quality of service keeps their messages from this node."""
+    """Name the publishers whose type or quality of service keeps their messages from this node."""
     faults = []
     for name, topic in heard_on.items():
         for offer in node.get_publishers_info_by_topic(name):
+            if offer.topic_type != topic.type_name:
+                faults.append(
+                    f"{topic.name}: no messages are received from {_name(offer)} (it publishes "
+                    f"{offer.topic_type}); publish {topic.type_name}, or remap its topic"
+                )
+                continue
             verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
             if verdict == QoSCompatibility.ERROR:
                 why = reason.removeprefix("ERROR: ").rstrip(";. ")

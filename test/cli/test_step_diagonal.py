@@ -413,6 +413,13 @@ def test_bag_options_are_checked(tmp_path, capsys, extra, message):
     assert code == 2 and message in err and err.count("\n") == 1
 
 
+def test_a_folder_that_is_not_a_bag_is_said_before_topics_are_asked_for(
+    tmp_path, capsys
+):
+    code, _, err = run(capsys, tmp_path, "--method", "new")
+    assert code == 2 and str(tmp_path) in err and "topic" not in err
+
+
 def test_a_bag_that_is_not_there_is_not_called_a_table(capsys):
     code, _, err = run(capsys, "BAG", "--method", "new", "--laser-topic", "/laser")
     assert code == 2

@@ -13,6 +13,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.duration import Duration
 from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.lifecycle import TransitionCallbackReturn
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.reader import BagReader
@@ -26,6 +27,7 @@ from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.nodes.solver import Solver
 from test.support.cameras import DETECTS, camera
+from test.support.ros import Graph
 from test.support.sessions import decoded, plan_file, small_plan
 
 MANAGED = {
@@ -271,6 +273,26 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph, capfd):
     assert node.get_name() == "measurement_collector"
     graph.until(lambda: len(heard) > 5, "further reports")
     assert capfd.readouterr().err.count("no messages are received from /hand") == 1
+
+
+@pytest.mark.usefixtures("quick_beat")
+def test_a_publisher_of_another_type_is_named(graph, capfd):
+    """Nothing is received from it, and DDS does not say so."""
+    graph.node(MeasurementCollector)
+    line = (
+        "stage/mark_detections: no messages are received from /hand (it publishes "
+        "std_msgs/msg/String); publish selfcal_msgs/msg/MarkDetection, or remap its topic"
+    )
+    said = []
+    other = Graph(graph.context.get_domain_id())
+    try:
+        other.hand.create_publisher(String, names.DETECTIONS.name, names.DETECTIONS.qos)
+        graph.until(
+            lambda: said.append(capfd.readouterr().err) or line in "".join(said),
+            "its type",
+        )
+    finally:
+        other.close()
 
 
 def test_no_event_of_a_stranger_is_due_when_a_subscription_ends(graph):
