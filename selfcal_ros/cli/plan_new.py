@@ -717,6 +717,12 @@ def _text(
         f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
         "shows where U comes from"
     )
+    strain = next(term for term in default_terms() if term.name == "plate_strain")
+    yield (
+        f"U assumes a plate that grows by {strain.size * UM_PER_M:g} µm/m (k = 1) from view "
+        "to view, fused silica within 0.1 K; for soda-lime glass write model_terms: "
+        f'["plate_strain:8e-7"] into {outputs[0]}'
+    )
     yield (
         f"it takes about {minutes_of(answers, plan):.0f} minutes: {_counted_visits(plan, answers)}"
     )

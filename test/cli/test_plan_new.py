@@ -72,6 +72,7 @@ def test_a_short_plate_is_stepped_over_a_long_stage(capsys):
     assert new(*long, "--minutes", "8", "--placing", "robot") == 0
     said = capsys.readouterr().out
     assert "the map covers 40 x 40 of 100 x 60 mm" in said
+    assert "a plate that grows by 0.07 µm/m (k = 1)" in said
     minutes = re.search(r"all of the travel takes --minutes (\d+)", said)[1]
 
     assert new(*long, "--minutes", minutes, "--placing", "robot", "--force") == 0
