@@ -450,8 +450,9 @@ def _wider(
         artifact = replace(plan.artifact, map_grid=_nodes(plan.artifact, tiles))
         once = replace(plan, artifact=artifact, views=(*plan.views, *tiles))
         untested = planned_system(artifact, once.views).nodes_untested
+        plans = list(_repeated(once))
         # in one pass the map would not be qualified
-        stepped += [list(_repeated(once))[untested:]]
+        stepped.append(plans[1:] if untested else plans)
         tick()
     if not stepped:
         return [], (

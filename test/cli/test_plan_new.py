@@ -67,7 +67,7 @@ def test_its_plan_is_checked_drawn_and_measured(options, minutes, capsys):
 
 
 def test_a_short_plate_is_stepped_over_a_long_stage(capsys):
-    """The map reaches the ends of the travel, and all of it lies within its U."""
+    """The map reaches the ends of the travel; it is determined, and all views are measured."""
     long = ["--travel", "100x60mm", "--marks", "5", "--pitch", "10mm"]
     assert new(*long, "--minutes", "8", "--placing", "robot") == 0
     said = capsys.readouterr().out
