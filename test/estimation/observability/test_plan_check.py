@@ -26,11 +26,14 @@ from selfcal_ros.estimation.observability.rank import (
     smaller,
     unseen_modes,
 )
+from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.observability import describe_view, with_advice
+from selfcal_ros.settings.estimator import read_plan
 from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of
 from test.support.refusals import in_words
+from test.support.sources import ROOT
 from test.support.truth import Spread, random_truth, simulate_measurements
 
 
@@ -333,6 +336,14 @@ def test_smaller_fields_keep_room_for_the_shifts():
     assert smaller(plan_of("0, 180", 21, size_y=5), 9).artifact.shape == (9, 5)
     assert smaller(plan_of("0, 90, ty", 41, size_y=61), 31).artifact.shape == (21, 31)
     assert smaller(plan_of("0, 90, ty2", 9, size_y=61), 31).artifact.shape == (7, 31)
+
+
+def test_a_plate_stepped_over_a_wider_map_is_judged_whole():
+    """On a smaller plate its steps would leave gaps in the map."""
+    plan = read_plan(ROOT / "config/plans/stepped.yaml")
+    assert plan.artifact.is_stepped and smaller(plan, 11) is plan
+    own_nodes = replace(plan.artifact, map_grid=MapGrid(5, 0.03))
+    assert not own_nodes.is_stepped
 
 
 @pytest.mark.parametrize(("size", "size_y"), [(21, 31), (31, 21), (11, 21)])
