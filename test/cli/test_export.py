@@ -213,6 +213,10 @@ def test_onto_combines_with_the_active_table(capsys):
             "--counts-per-unit: it is given for [1]",
         ),
         ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
+        (
+            "pmac R.json -o t.txt --counts-per-unit 1=2 --counts-per-unit 2=2",
+            "--counts-per-unit: every entry of the tables would be 0: they are in 31.2 µm",
+        ),
         ("kmotion R.json -o R.json", "R.json: would be overwritten"),
         ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
         (

@@ -29,6 +29,7 @@ from selfcal_ros.compensation.export import decimal
 from selfcal_ros.compensation.residual import Correction, Covering
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.units import UM_PER_M
 
 Texts = dict[str, list[str]]
 """Lines of each file, by what is added to its name: "", or "x" and "y"."""
@@ -140,8 +141,20 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     px, py = np.meshgrid(*at, indexing="ij")
     correct = wanted(error_map, wiring)
     tables = {}
+    corrections = correct(px, py)
+    changes = [
+        float(np.abs(PER_COUNT * per * (values - values[0, 0])).max())
+        for values, per in zip(corrections, counts, strict=True)
+    ]
+    if 0 < max(changes) < 0.5:
+        coarsest_m = frame.unit_m / (PER_COUNT * min(counts))
+        raise InputError(
+            "--counts-per-unit",
+            f"every entry of the tables would be 0: they are in {UM_PER_M * coarsest_m:.3g} µm",
+            f"give the counts per {frame.unit}",
+        )
     for motor, values, per in zip(
-        (frame.x_axis, frame.y_axis), correct(px, py), counts, strict=True
+        (frame.x_axis, frame.y_axis), corrections, counts, strict=True
     ):
         integers = (
             np.rint(PER_COUNT * per * (values - values[0, 0])).astype(int).T.ravel()[1:]
