@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 from selfcal_ros.errors import InputError
 
+STDOUT = "-"
+"""Name of an output file: the result goes to stdout, everything else to stderr."""
 OUTPUTS = {"--output", "--report", "--plot", "--theta-output", "--cal", "--save-csv"}
 """Options that name a file to write."""
 FOLDERS = ("BAG", "FOLDER", "DIR")
@@ -126,12 +128,27 @@ def check_existing(args: argparse.Namespace) -> None:
     from selfcal_ros.outputs import refuse_existing  # with numpy
 
     inputs = {os.path.realpath(item.path) for item in _files(args)}
+    for action in args.leaf._actions:
+        if OUTPUTS.intersection(action.option_strings):
+            _refuse_stdout(getattr(args, action.dest), action)
     for action in _outputs(args.leaf):
         name = getattr(args, action.dest)
+        if name == STDOUT:
+            continue
         place = os.path.realpath(name or "")
         if name and place not in inputs and os.path.dirname(place) not in inputs:
             _refuse_ending(name, str(action.metavar))
             refuse_existing([name], force=args.force)
+
+
+def _refuse_stdout(name: str | None, action: argparse.Action) -> None:
+    """Raise InputError for ``-`` if it does not stand for stdout: it would be a file's name."""
+    if name == STDOUT and "stdout" not in str(action.help):
+        raise InputError(
+            f"{action.option_strings[-1]} {STDOUT}",
+            "this cannot be written to stdout",
+            f"name a {'folder' if action.metavar in FOLDERS else 'file'}",
+        )
 
 
 def _refuse_ending(path: str, metavar: str) -> None:

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from itertools import compress
 from typing import cast
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put, tell
+from selfcal_ros.cli.arguments import STDOUT
+from selfcal_ros.cli.terminal import add_json, aside, busy, file_of, put, tell
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.combine import Member, combine
 from selfcal_ros.estimation.comparison.external import map_from_table

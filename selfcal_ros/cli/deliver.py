@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from selfcal_ros.applications.aerotech.write import write_cals
-from selfcal_ros.cli.terminal import STDOUT, exit_code, put, put_text, say
+from selfcal_ros.cli.arguments import STDOUT
+from selfcal_ros.cli.terminal import exit_code, put, put_text, say
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, utf8, write_bytes
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from selfcal_ros.cli.arguments import STDOUT
 from selfcal_ros.cli.deliver import deliver
-from selfcal_ros.cli.terminal import STDOUT, add_json, file_of
+from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TextIO
 
+from selfcal_ros.cli.arguments import STDOUT
 from selfcal_ros.errors import ExitCode, visible
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
@@ -17,9 +18,6 @@ from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
 from selfcal_ros.portable import fitted
 from selfcal_ros.settings.nodes import overrides_in
 from selfcal_ros.settings.parameter import TYPED, Settings
-
-STDOUT = "-"
-"""Name of an output file: the result goes to stdout, everything else to stderr."""
 
 
 class Once(argparse.Action):

@@ -64,6 +64,36 @@ def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        "export linuxcnc R.json",
+        "cal export R.json",
+        "cal orthogonality R.json",
+        "plate config/plans/hu.yaml",
+        "plan new --travel 80mm --marks 7 --pitch 10mm",
+        "simulate config/simulations/demo.yaml",
+        "batch bags",
+    ],
+)
+def test_a_dash_is_no_file(desk, capsys, words):
+    before = set(desk.iterdir())
+    assert main([*words.split(), "-o", "-"]) == 2
+    assert re.fullmatch(
+        rf"{verb_of(words)}: --output -: this cannot be written to stdout; name a "
+        r"(file|folder)\n",
+        capsys.readouterr().err,
+    )
+    assert set(desk.iterdir()) == before
+
+
+def test_a_file_that_is_named_dash_does_not_bar_stdout(desk, capsys):
+    (desk / "-").write_text("mine")
+    assert main(["table", "R.json", "-o", "-"]) == 0
+    assert capsys.readouterr().out.startswith("m,n,x_m")
+    assert (desk / "-").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
     ("words", "line"),
     [
         (
