@@ -433,17 +433,44 @@ def say_bent(args: argparse.Namespace, bent_m: float) -> None:
         )
 
 
+def require_same_axes(
+    args: argparse.Namespace, where: str, comments: Sequence[str], frame: MachineFrame
+) -> None:
+    """Refuse an active table that says it is for other axes; say if its zero lies elsewhere.
+
+    Zero may do so: the stage frame is that of the field, and two calibrations may have two.
+    """
+    stated = frame_from_comments(comments)
+    if stated is None:
+        return
+    if not stated.same_axes(frame):
+        raise InputError(
+            where,
+            f"it says '{stated.comment()}', and the options '{frame.comment()}'",
+            "give the options with which it was written",
+        )
+    if (stated.home_x_m, stated.home_y_m) != (frame.home_x_m, frame.home_y_m):
+        warn(
+            args,
+            f"--onto: {where} says '{stated.comment()}', and the options "
+            f"'{frame.comment()}': right only if the fields of both calibrations lie "
+            "apart by the difference",
+        )
+
+
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
     """Return the correction by the file of ``--onto``."""
     if args.onto is None:
         return None
-    tables = CalEvaluator(load_cal(args.onto).tables, setup_of(frame))
+    cal = load_cal(args.onto)
+    tables = CalEvaluator(cal.tables, setup_of(frame))
     if not {*tables.inputs, *tables.outputs} <= {frame.x_axis, frame.y_axis}:
         raise InputError(
             args.onto,
             f"it is for axes {[*tables.inputs, *tables.outputs]}",
             "name its axes with --x-axis and --y-axis; theta is not combined",
         )
+    require_same_axes(args, args.onto, cal.comments, frame)
     return plane_correction(tables, frame)
 
 

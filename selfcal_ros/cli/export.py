@@ -3,9 +3,22 @@
 
 import argparse
 
-from selfcal_ros.applications.controllers.export import FORMATS, export, loaded
+from selfcal_ros.applications.controllers.export import (
+    FORMATS,
+    comments_of,
+    export,
+    loaded,
+    require_written_so,
+)
 from selfcal_ros.applications.controllers.grid import Source, Wiring
-from selfcal_ros.cli.cal import figures_of, numbered, ready, residual_text, say_bent
+from selfcal_ros.cli.cal import (
+    figures_of,
+    numbered,
+    ready,
+    require_same_axes,
+    residual_text,
+    say_bent,
+)
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say, warn
@@ -70,9 +83,11 @@ def run(args: argparse.Namespace) -> int:
     result, filled = ready(args)
     active = None
     if args.onto:
-        active = loaded(
-            args.format, [Source(read_text(path), path) for path in args.onto], wiring
-        )
+        sources = [Source(read_text(path), path) for path in args.onto]
+        comments = [line for source in sources for line in comments_of(source.text)]
+        require_same_axes(args, sources[0].where, comments, wiring.frame)
+        require_written_so(args.format, sources, wiring)
+        active = loaded(args.format, sources, wiring)
     exported = export(
         args.format,
         result,

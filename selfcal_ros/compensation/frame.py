@@ -123,6 +123,13 @@ class MachineFrame:
         """Return stage angles in rad of controller positions in deg."""
         return self.sign_theta * np.deg2rad(position_deg) + self.home_theta_rad
 
+    def same_axes(self, other: "MachineFrame") -> bool:
+        """Return whether x and y have the same indices, unit and directions in another frame."""
+        return all(
+            getattr(self, name) == getattr(other, name)
+            for name in ("x_axis", "y_axis", "unit", "reverse_x", "reverse_y")
+        )
+
     def comment(self) -> str:
         """Return the frame as a comment of a calibration file."""
         words = [

@@ -247,3 +247,61 @@ def test_a_table_that_does_not_fit_is_refused_as_such(
         capsys.readouterr().err,
     )
     assert not Path("new").exists()
+
+
+@pytest.mark.parametrize(
+    ("verb", "old", "new", "where"),
+    [
+        ("export kmotion", "--unit in", "--unit mm", "old.txt: it says 'machine: "),
+        ("export kmotion", "", "--reverse-y", "old.txt: it says 'machine: "),
+        ("cal export", "--reverse-x", "", "old.txt: it says 'machine: "),
+        ("export beckhoff", "--x-axis 3", "", "old_x.txt: it says 'machine: "),
+        ("export siemens", "--negate", "", "old.txt: it says 'this table: subtracted'"),
+        (
+            "export pmac",
+            "--counts-per-unit 1=2000 --counts-per-unit 2=2000",
+            "--counts-per-unit 1=2000 --counts-per-unit 2=4000",
+            "old.txt: it says 'this table: counts per unit 2000 and 2000'",
+        ),
+    ],
+)
+def test_an_active_table_that_states_another_wiring_is_refused(
+    tmp_path, monkeypatch, capsys, verb, old, new, where
+):
+    """Read with the wrong options it was added where the machine has other errors."""
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(G)))
+    words = [*verb.split(), "R.json", "-o"]
+    assert main([*words, "old.txt", *old.split()]) == 0
+    files = sorted(str(path) for path in Path().glob("old*.txt"))
+    capsys.readouterr()
+    assert main([*words, "new.txt", *new.split(), "--onto", *files]) == 2
+    err = capsys.readouterr().err
+    assert f": {where}" in err and err.count("\n") == 1
+    assert not list(Path().glob("new*.txt"))
+    assert main([*words, "new.txt", *old.split(), "--onto", *files]) == 0
+    assert "--onto" not in capsys.readouterr().err
+
+
+def test_files_of_x_and_y_are_not_exchanged(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(sayable("linuxcnc", G))))
+    words = ["export", "linuxcnc", "R.json", "-o"]
+    assert main([*words, "old.txt"]) == 0
+    assert main([*words, "new.txt", "--onto", "old_y.txt", "old_x.txt"]) == 2
+    assert "old_y.txt: it says 'this table: the file of y'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["export kmotion", "cal export"])
+def test_another_zero_than_that_of_the_active_table_is_said(
+    tmp_path, monkeypatch, capsys, verb
+):
+    """It is right if the plate lay elsewhere on the stage, and wrong if it was forgotten."""
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(G)))
+    words = [*verb.split(), "R.json", "--unit", "mm", "-o"]
+    assert main([*words, "old.txt", "--home-x", "2"]) == 0
+    capsys.readouterr()
+    assert main([*words, "new.txt", "--onto", "old.txt"]) == 0
+    err = capsys.readouterr().err
+    assert "old.txt says 'machine: " in err and "right only if the fields" in err

@@ -42,8 +42,14 @@ HELD = 0.01
 """Part of the errors at the nodes below which a format holds the map."""
 IMPLIED = (
     "the sense is not documented: the value is taken to be added; if --negate of selfcal "
-    "export is needed, the machine gets twice its error",
+    "export is needed, the machine gets twice its error"
 )
+NEGATED = (
+    "the sense is not documented: the value is taken to be subtracted (--negate), and is "
+    "- (indicated - true); a controller that adds it gets twice its error"
+)
+HOW = "this table: "
+"""Begins the comment that says of a file what the frame of the machine does not."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +258,7 @@ def export(
         form.what,
         *provenance(result, frame, filled=filled, command=command),
         *(note.format(unit=frame.unit) for note in form.notes),
-        *(IMPLIED if form.sign_is_implied else ()),
+        *([NEGATED if wiring.negate else IMPLIED] if form.sign_is_implied else []),
         _remaining_text(residuals[0]),
     ]
     if active is not None:
@@ -260,14 +266,16 @@ def export(
             "replaces the table that was loaded during the calibration; what that "
             f"bends between the nodes of the map, up to {UM_PER_M * bent:.3g} µm, is lost"
         )
-    head = [form.comment + spelled_out(_plain(line)) for line in comments]
-    files = {
-        names[part]: "\n".join(
-            [*lines, "", *head] if form.comments_last else [*head, *lines]
+    files = {}
+    for part, lines in texts.items():
+        head = [
+            form.comment + spelled_out(_plain(line))
+            for line in [*comments, *_how(form, wiring, part)]
+        ]
+        files[names[part]] = (
+            "\n".join([*lines, "", *head] if form.comments_last else [*head, *lines])
+            + "\n"
         )
-        + "\n"
-        for part, lines in texts.items()
-    }
     remains = (
         ""
         if residuals[0].rms("after") < HELD * residuals[0].rms("before")
@@ -280,6 +288,21 @@ def export(
         checklist(form, wiring, list(files), correct, table),
         remains,
     )
+
+
+def _how(form: Format, wiring: Wiring, part: str) -> list[str]:
+    """Return the comment on which file it is, on the counts and on the sense; or none."""
+    words = [f"the file of {part}"] if part else []
+    if wiring.counts is not None:
+        words.append("counts per unit {:.15g} and {:.15g}".format(*wiring.counts))
+    if form.sign_is_implied:
+        words.append("subtracted" if wiring.negate else "added")
+    return [HOW + ", ".join(words)] if words else []
+
+
+def comments_of(text: str) -> list[str]:
+    """Return the lines of a table without what begins a comment."""
+    return [line.lstrip("#; ") for line in text.splitlines()]
 
 
 def _plain(text: str) -> str:
@@ -366,3 +389,17 @@ def loaded(name: str, sources: Sequence[Source], wiring: Wiring) -> Correction:
             f"{name} has {len(parts)}: " + (", ".join(parts) or "the table"),
         )
     return FORMATS[name].read(sources, wiring)
+
+
+def require_written_so(name: str, sources: Sequence[Source], wiring: Wiring) -> None:
+    """Raise InputError if a file says that it is another one, of other counts or sense."""
+    form = FORMATS[name]
+    for part, source in zip(form.parts, sources, strict=False):
+        own = _how(form, wiring, part)
+        for line in comments_of(source.text):
+            if line.startswith(HOW) and [line] != own:
+                raise InputError(
+                    source.where,
+                    f"it says '{line}', and is taken for '{''.join(own)}'",
+                    "give the options with which it was written, of two files x first",
+                )
