@@ -275,7 +275,7 @@ def run(args: argparse.Namespace) -> int:
     say(
         args,
         "\n".join(_text(answers, plan, prediction, why_not, outputs)),
-        _json(answers, plan, prediction, outputs),
+        _json(answers, plan, prediction, why_not, outputs),
     )
     return int(ExitCode.DONE)
 
@@ -677,14 +677,15 @@ def _simulation(answers: Known, plan: str) -> dict[str, Any]:
     return out
 
 
-def _read_half_m(plan: Plan) -> list[float]:
-    """Return how far to either side of the middle marks are read along x and y, m."""
+def _covered_m(plan: Plan) -> list[float]:
+    """Return the sides of the field that the map covers, about the middle of the travel, m."""
     artifact = plan.artifact
     shifts = np.array(
         [view.translation_m for view in plan.views if not view.rotation_rad]
     )
     both_sides = np.minimum(shifts.max(axis=0), -shifts.min(axis=0))
-    return list(both_sides + np.array(artifact.half) * artifact.grid_pitch_m)
+    read_half_m = both_sides + np.array(artifact.half) * artifact.grid_pitch_m
+    return list(2 * np.minimum(artifact.field_half_m, read_half_m))
 
 
 def _text(
@@ -697,10 +698,7 @@ def _text(
     budget, further_view = prediction
     artifact = plan.artifact
     nx, ny = artifact.shape
-    span = " x ".join(
-        f"{2 * min(half, read) * MM_PER_M:.4g}"
-        for half, read in zip(artifact.field_half_m, _read_half_m(plan), strict=True)
-    )
+    span = " x ".join(f"{side * MM_PER_M:.4g}" for side in _covered_m(plan))
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)
     yield (
         f"plan {plan.plan_id}: {nx} x {ny} marks, {answers.lines or 'no'} angular lines; the map "
@@ -747,6 +745,7 @@ def _json(
     answers: Known,
     plan: Plan,
     prediction: tuple[PlanBudget, tuple[View, float] | None],
+    why_not: str,
     outputs: list[Path],
 ) -> dict[str, Any]:
     budget, further_view = prediction
@@ -755,6 +754,8 @@ def _json(
         "plan_id": plan.plan_id,
         "written": list(map(str, outputs)),
         "views": [view_to_dict(view, plan.artifact) for view in plan.views],
+        "covers": _covered_m(plan),
+        "why_not_wider": why_not or None,
         "minutes": minutes_of(answers, plan),
         "exposures": _exposures(plan),
         "U_xy": 2 * budget.u_rms("xy"),

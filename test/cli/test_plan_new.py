@@ -103,6 +103,11 @@ def test_a_map_of_the_plate_alone_says_why(travel, minutes, line, capsys):
     assert new("--travel", travel, *options) == 0
     said = capsys.readouterr().out
     assert line in said if line else "all of the travel" not in said
+    assert new("--travel", travel, *options, "--force", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert line in found["why_not_wider"] if line else found["why_not_wider"] is None
+    plate = 0.002 if travel == "1m" else 0.04
+    assert found["covers"] == pytest.approx([plate, plate])
 
 
 def test_on_a_full_disk_none_of_its_files_is_left(tmp_path, monkeypatch, capsys):
