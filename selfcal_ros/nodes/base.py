@@ -13,7 +13,10 @@ from rcl_interfaces.msg import (
     ParameterType,
 )
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import (
+    PublisherEventCallbacks,
+    SubscriptionEventCallbacks,
+)
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 
@@ -23,9 +26,10 @@ from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import (
     HEALTH,
     Topic,
-    mismatched,
     others_publishing,
     private,
+    unheard,
+    unreached,
 )
 from selfcal_ros.nodes.services import Answering
 from selfcal_ros.nodes.sessions.clocks import RosTime
@@ -60,8 +64,9 @@ class NodeBase[S: Settings](Answering):
         self.losses = Losses(self.say, time.monotonic)
         self._ros_time = RosTime(self.say)
         self.alone_on: list[str] = []
-        self._heard_on: dict[str, Topic] = {}
-        self._unheard = ""  # publishers whose messages are not received, as last logged
+        self._subscribed: dict[str, Topic] = {}
+        self._published: dict[str, Topic] = {}
+        self._unmatched: set[str] = set()  # endpoints without messages, as logged
         try:
             self._take_parameters(kind)
             self.set_descriptor(
@@ -99,8 +104,13 @@ class NodeBase[S: Settings](Answering):
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""
+        self._published[self.resolve_topic_name(topic.name)] = topic
+        # no default callbacks: one due when a publisher ends would end the process (rclpy 1644)
+        events = PublisherEventCallbacks(use_default_callbacks=False)
         return self.own(
-            self.create_publisher(topic.type, topic.name, topic.qos),
+            self.create_publisher(
+                topic.type, topic.name, topic.qos, event_callbacks=events
+            ),
             self.destroy_publisher,
         )
 
@@ -119,7 +129,7 @@ class NodeBase[S: Settings](Answering):
             if hasattr(callback, "__signature__")
             else self.guarded(callback, topic.name)
         )
-        self._heard_on[name] = topic
+        self._subscribed[name] = topic
 
         def lost(event: Any) -> None:
             # otherwise only the newest is used: the others are not lost
@@ -203,11 +213,12 @@ class NodeBase[S: Settings](Answering):
 
     def report(self) -> None:
         """Publish the health of this node."""
-        unheard = mismatched(self, self._heard_on)
-        if unheard.message not in ("", self._unheard):
-            self.say(Level.ERROR, unheard.message)
-        self._unheard = unheard.message
-        graph = [unheard, others_publishing(self, self.alone_on)]
+        graph = [unheard(self, self._subscribed), unreached(self, self._published)]
+        for found in graph:
+            if found.message and found.message not in self._unmatched:
+                self.say(found.level, found.message)
+        self._unmatched = {found.message for found in graph}
+        graph.append(others_publishing(self, self.alone_on))
         clock = self._ros_time.look(
             simulated=self.get_parameter("use_sim_time").value,
             now_ns=self.get_clock().now().nanoseconds,

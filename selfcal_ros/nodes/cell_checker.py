@@ -19,7 +19,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.names import MatchedInput, mismatched
+from selfcal_ros.nodes.names import MatchedInput, unheard
 from selfcal_ros.nodes.running import run
 from selfcal_ros.nodes.sessions.cell_check import CellCheck
 from selfcal_ros.nodes.sessions.health import Level
@@ -93,8 +93,8 @@ class CellChecker(SelfcalNode[CollectorSettings]):
             ]
             self.session.publishers[topic] = sorted(nodes)
         detections = self.resolve_topic_name(names.DETECTIONS.name)
-        unheard = mismatched(self, {detections: names.DETECTIONS})
-        self.session.take_health("quality of service", unheard.level, unheard.message)
+        found = unheard(self, {detections: names.DETECTIONS})
+        self.session.take_health("quality of service", found.level, found.message)
         self.session.tick()
         for item in self.session.items[self._said :]:
             print(json.dumps(asdict(item)), flush=True)

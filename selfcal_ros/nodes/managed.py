@@ -182,7 +182,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
                     self._made[step].pop()()
                 self._made[step] = []  # its callbacks are no longer called
             if "configure" in steps:
-                self._heard_on.clear()
+                self._subscribed.clear()
                 self.alone_on.clear()
                 self.held.clear()
         except Exception as error:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -52,6 +53,9 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
         durability=DurabilityPolicy.TRANSIENT_LOCAL
         if latched
         else DurabilityPolicy.VOLATILE,
+        # as DDS states what is not asked for: subscribers are compared with it
+        deadline=Infinite,
+        liveliness_lease_duration=Infinite,
     )
 
 
@@ -126,25 +130,45 @@ RESULTS = (STATUS, MEASUREMENT, ERROR_MAP, SUMMARY, CORRECTED)
 COMMANDED = (MOTION, CORRECTED_MOTION)
 
 
-def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
+def unheard(node: Node, subscribed: Mapping[str, Topic]) -> Diagnosis:
     """Name the publishers whose type or quality of service keeps their messages from this node."""
     faults = []
-    for name, topic in heard_on.items():
-        for offer in node.get_publishers_info_by_topic(name):
-            if offer.topic_type != topic.type_name:
+    for name, topic in subscribed.items():
+        for other in node.get_publishers_info_by_topic(name):
+            who = f"{topic.name}: no messages are received from {_name(other)}"
+            if other.topic_type != topic.type_name:
                 faults.append(
-                    f"{topic.name}: no messages are received from {_name(offer)} (it publishes "
-                    f"{offer.topic_type}); publish {topic.type_name}, or remap its topic"
+                    f"{who} (it publishes {other.topic_type}); publish {topic.type_name}, "
+                    "or remap its topic"
                 )
-                continue
-            verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
-            if verdict == QoSCompatibility.ERROR:
-                why = reason.removeprefix("ERROR: ").rstrip(";. ")
-                faults.append(
-                    f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
-                    "offer the QoS in docs/reference/ros2.md"
-                )
+            elif why := _incompatible(offer=other.qos_profile, request=topic.qos):
+                faults.append(f"{who} ({why}); offer the QoS in docs/reference/ros2.md")
     return Diagnosis(Level.ERROR if faults else Level.OK, "; ".join(faults))
+
+
+def unreached(node: Node, published: Mapping[str, Topic]) -> Diagnosis:
+    """Name the subscribers that this node's messages do not reach, by type or by QoS."""
+    faults = []
+    for name, topic in published.items():
+        for other in node.get_subscriptions_info_by_topic(name):
+            who = f"{topic.name}: no messages reach {_name(other)}"
+            if other.topic_type != topic.type_name:
+                faults.append(
+                    f"{who} (it subscribes to {other.topic_type}); subscribe to "
+                    f"{topic.type_name}, or remap its topic"
+                )
+            elif why := _incompatible(offer=topic.qos, request=other.qos_profile):
+                faults.append(
+                    f"{who} ({why}); subscribe with the QoS in docs/reference/ros2.md"
+                )
+    return Diagnosis(Level.WARN if faults else Level.OK, "; ".join(faults))
+
+
+def _incompatible(*, offer: QoSProfile, request: QoSProfile) -> str:
+    verdict, reason = qos_check_compatible(offer, request)
+    if verdict != QoSCompatibility.ERROR:
+        return ""
+    return reason.replace("ERROR: ", " ").strip(";. ")
 
 
 def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:

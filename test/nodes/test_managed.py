@@ -308,6 +308,53 @@ def test_no_event_of_a_stranger_is_due_when_a_subscription_ends(graph):
     assert kinds == {
         QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST,
     }
+    outputs = {topic.name for topic in (names.STATUS, names.MEASUREMENT)}
+    published = [
+        publisher
+        for publisher in node.publishers
+        if publisher.topic_name.removeprefix("/") in outputs
+    ]
+    assert len(published) == len(outputs)
+    assert not any(publisher.event_handlers for publisher in published)
+
+
+@pytest.mark.usefixtures("quick_beat")
+@pytest.mark.parametrize(
+    ("kind", "qos", "line"),
+    [
+        (
+            names.CORRECTED.type,
+            names._qos(10),
+            "stage/corrected_joint_states: no messages reach /hand (Best effort publisher and "
+            "reliable subscription); subscribe with the QoS in docs/reference/ros2.md",
+        ),
+        (
+            String,
+            names.CORRECTED.qos,
+            "stage/corrected_joint_states: no messages reach /hand (it subscribes to "
+            "std_msgs/msg/String); subscribe to sensor_msgs/msg/JointState, or remap its topic",
+        ),
+    ],
+)
+def test_a_subscriber_that_is_not_reached_is_named_once(graph, capfd, kind, qos, line):
+    graph.node(CompensatorNode)
+    heard: list = []
+    topic = names.of_node("compensator", names.HEALTH)
+    graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
+    other = Graph(graph.context.get_domain_id())
+    try:
+        other.hand.create_subscription(kind, names.CORRECTED.name, print, qos)
+        graph.until(
+            lambda: any(
+                line in s.message and s.level == DiagnosticStatus.WARN for s in heard
+            ),
+            line,
+        )
+        heard.clear()
+        graph.until(lambda: len(heard) > 5, "further reports")
+    finally:
+        other.close()
+    assert capfd.readouterr().err.count("no messages reach /hand") == 1
 
 
 @pytest.mark.usefixtures("quick_beat")
