@@ -110,53 +110,93 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     system = placed(model.problem)
     if system is None or system.grid.too_large_to_refine:
         return None
-    grid = system.grid
-    coarse = _of_marks(model)
-    refit = with_map(model, grid.views.spline.refined)
-    if refit is None:
+    refined = with_map(model, system.grid.views.spline.refined)
+    if refined is None:
         return None
-    fine = _of_marks(refit)
-    n = [equations.determined_coefficients for equations in (fine, coarse)]
-    squares_coarse, squares_refit = _squares(coarse, model.y), _squares(fine, refit.y)
-    readings = grid.equations_of_map
-    n_further = n[0] - n[1]
-    dof = readings - n[0]
-    p = 1.0
-    power = np.zeros(2 * len(known_places(coarse)))
-    bilinear = grid.views.spline.axes[0].degree == 1
-    if dof < 1 and not bilinear:
+    coarse, fine = _of_marks(model), _of_marks(refined)
+    dof = system.grid.equations_of_map - fine.determined_coefficients
+    if dof < 1 and not _is_bilinear(coarse):
         return None
-    if dof >= 1 and n_further >= 1:
-        p = _improved(squares_coarse, squares_refit, n_further, dof)
-        if p < 1.0:
-            y = refit.y if p < F_LEVEL else model.y  # the terms of a map that suffices
-            power = _Further.of(fine, coarse, y).power(
-                max(float(np.sqrt(squares_refit / dof)), FLOOR)
-            )
-        power = power + _of_terms(model, refit) ** 2 * (p < F_LEVEL)
-    if bilinear and squares_coarse > readings * FLOOR**2:
-        smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
-        if (refit := with_map(model, smooth)) is not None:
-            squares_refit = max(
-                _squares(_of_marks(refit), refit.y), FLOOR * squares_coarse
-            )
-            likelier = math.exp(
-                min(
-                    (readings - n[1]) / 2 * math.log(squares_refit / squares_coarse),
-                    0.0,
-                )
-            )
-            p, power_refit = min(p, likelier), _apart(refit, model)
-            power = (
-                power_refit
-                if likelier < F_LEVEL and power_refit.mean() > power.mean()
-                else power
-            )
-    local = np.zeros((2, *grid.views.shape))
+    finer = _against_finer(model, refined)
+    smoother = _against_smoother(model)
+    power = finer.power
+    if smoother.shown and smoother.power.mean() > power.mean():
+        power = smoother.power
+    shape = system.grid.views.shape
+    local = np.zeros((2, *shape))
     i, j = _halves(coarse)
     nodes = (i % 2 == 0) & (j % 2 == 0)
     local[:, i[nodes] // 2, j[nodes] // 2] = np.sqrt(power.reshape(2, -1)[:, nodes])
-    return Adequacy(p, float(np.sqrt(power.mean())), n_further, grid.views.shape, local)
+    return Adequacy(
+        p=min(finer.p, smoother.p),
+        lack=float(np.sqrt(power.mean())),
+        coefficients=fine.determined_coefficients - coarse.determined_coefficients,
+        nodes=shape,
+        local=local,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A map against another one of the same readings.
+
+    Attributes
+    ----------
+    p : float
+        Probability by chance that the other map explains the readings so much better.
+    power : float array (2 P,)
+        Squared error of the map at the known places, m^2.
+    """
+
+    p: float
+    power: np.ndarray
+
+    @property
+    def shown(self) -> bool:
+        """Whether the readings show that the map does not suffice."""
+        return self.p < F_LEVEL
+
+
+def _against_finer(model: ModelFit, refined: ModelFit) -> _Comparison:
+    """Compare a map with one of twice as many intervals (method eq. 12.4)."""
+    coarse, fine = _of_marks(model), _of_marks(refined)
+    nothing = np.zeros(2 * len(known_places(coarse)))
+    dof = coarse.grid.equations_of_map - fine.determined_coefficients
+    n_further = fine.determined_coefficients - coarse.determined_coefficients
+    if dof < 1 or n_further < 1:
+        return _Comparison(1.0, nothing)
+    squares_fine = _squares(fine, refined.y)
+    p = _improved(_squares(coarse, model.y), squares_fine, n_further, dof)
+    if p == 1.0:
+        return _Comparison(p, nothing)
+    suffices = p >= F_LEVEL
+    y = model.y if suffices else refined.y  # the terms of a map that suffices
+    sigma_m = max(float(np.sqrt(squares_fine / dof)), FLOOR)
+    power = _Further.of(fine, coarse, y).power(sigma_m)
+    if not suffices:
+        power = power + _of_terms(model, refined) ** 2
+    return _Comparison(p, power)
+
+
+def _against_smoother(model: ModelFit) -> _Comparison:
+    """Compare a bilinear map with the bicubic one of the same nodes, by likelihood."""
+    coarse = _of_marks(model)
+    nothing = _Comparison(1.0, np.zeros(2 * len(known_places(coarse))))
+    squares, n_readings = _squares(coarse, model.y), coarse.grid.equations_of_map
+    if not _is_bilinear(coarse) or squares <= n_readings * FLOOR**2:
+        return nothing
+    artifact = coarse.grid.views.artifact
+    smooth = with_map(model, MapSpline.of(artifact.field, Interpolation.BICUBIC))
+    if smooth is None:
+        return nothing
+    squares_smooth = max(_squares(_of_marks(smooth), smooth.y), FLOOR * squares)
+    dof = n_readings - coarse.determined_coefficients
+    likelihood_ratio = math.exp(min(dof / 2 * math.log(squares_smooth / squares), 0.0))
+    return _Comparison(likelihood_ratio, _apart(smooth, model))
+
+
+def _is_bilinear(system: PlacedEquations) -> bool:
+    return system.grid.views.spline.axes[0].degree == 1
 
 
 def _of_marks(model: ModelFit) -> PlacedEquations:
