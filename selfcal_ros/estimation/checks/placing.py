@@ -30,8 +30,6 @@ from selfcal_ros.model.readings import Measurements, ViewReadings
 
 WINDOW = 3
 """Sites used on either side of the centre of the field."""
-LEAST_READINGS = 12
-"""Smallest number of readings in the window for a view to be judged."""
 EXPLAINED = 1.5
 """Mean square of the standardised readings up to which the plan's poses explain them."""
 CONTRADICTED = 4.0
@@ -41,6 +39,8 @@ UNREPEATED = 0.1
 
 FREE = 6
 """Number of complex columns of a view's own motion and shape."""
+LEAST_READINGS = 2 * FREE
+"""Smallest number of readings in the window for a view to be judged: half of them are left over."""
 BETTER = 30.0
 """Gain of the log-likelihood above which another pose is accepted."""
 CLEARLY = 10.0

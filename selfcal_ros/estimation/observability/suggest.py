@@ -42,13 +42,14 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import Plan, View
 
-TURNS_DEG = (0, 30, 60, 90, 120, 150, 180, 210, 240, 270, 300, 330)
-"""Turns from which the search starts, as far apart as its first step of the turn."""
 SHIFTS = ((0.0, 0.0), (0.5, 0.5), (1.3, -0.7), (-1.3, 0.7), (-0.5, 1.5), (0.5, -1.5))
 """Shifts, in pitches, from which the search starts: none, half a pitch, and beyond one."""
 
 STEPS = ((30, 1.0), (15, 0.5), (5, 0.2), (1, 0.1))
 """Steps of the turn, in degrees, and of the shift, in pitches, one after the other."""
+
+TURNS_DEG = range(0, 360, STEPS[0][0])
+"""Turns from which the search starts, as far apart as its first step of the turn."""
 
 REACH = 0.2
 """Largest shift along an axis, as a part of the plate: beyond it too few marks are in the field."""

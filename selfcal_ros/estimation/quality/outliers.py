@@ -198,14 +198,14 @@ def noisy_views(
     return tuple(ViewNoise(name, ratios[name]) for name in names if name in ratios)
 
 
-AMBIGUOUS = 16.0
-"""Difference of chi^2 up to which two places explain the readings equally well."""
-
 MAX_PLACES = 20
 """Largest number of places tested along each axis of a view."""
 
 CLIP = 4.0
 """Standard deviations to which residuals are clipped: one outlier is not a slip."""
+
+AMBIGUOUS = CLIP**2
+"""Difference of chi^2 up to which two places explain the readings equally well: one outlier."""
 
 
 def find_slip(
