@@ -596,32 +596,12 @@ class LinesCovariance:
     def of_stage(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
         rows = conditions.rows.T
-        misclosure = (
-            -rows,
-            np.zeros(rows.shape),
-            self.cover.functionals(conditions.slopes)[:2],
-        )
-        closure = self.of(*misclosure)
-        y = self.angular.response
-        n = self.angular.n_lines
-        inverse = np.concatenate(
-            [
-                self.angular.solve(np.eye(n, len(block), -block[0]))[
-                    block, block - block[0]
-                ]
-                for block in self._blocks()
-            ]
-        )
-        phi = self.cover.inverse[np.ix_(self.system.phi_at, self.system.phi_at)] * (
-            self._xy2 / self.cover.length**2
-        )
-        variance = in_datum(
-            self._theta2 * inverse,
-            ((y, phi), (self.terms[0], self._of_terms)),
-            self._spread(*misclosure)[0],
-            conditions.gain,
-            closure,
-        )[0]
+        no_plate = np.zeros_like(rows)
+        slopes = self.cover.independent(*self.cover.functionals(conditions.slopes)[:2])
+        closure = self.of(-rows, no_plate, slopes)
+        gain = conditions.gain.T
+        stage = np.eye(len(rows)) - rows @ gain
+        variance = self._variances(stage, no_plate @ gain, slopes, gain)
         return np.where(self.system.known_lines, variance, np.nan), closure
 
     def of_plate(self) -> np.ndarray:
@@ -630,44 +610,52 @@ class LinesCovariance:
         The rotations of the views are those for which neither stage nor plate is turned.
         """
         system = self.system
-        angular = self.angular
+        turns = self.cover.independent(
+            *(
+                -gauge.dual(2).reshape(-1, 1) / self.cover.length
+                for gauge in (system.gauge, system.plate_gauge)
+            )
+        )
         count = self.angular.n_lines
-        of_sites, of_marks = (
-            -gauge.dual(2).reshape(-1, 1) / self.cover.length
-            for gauge in (system.gauge, system.plate_gauge)
-        )
-        datum = (
-            (system.known_lines / system.known_lines.sum())[:, None],
-            np.zeros((count, 1)),
-            (of_sites, of_marks),
-        )
-        own_variance = np.zeros(count)
-        for block in self._blocks():
-            unit = np.eye(count, len(block), -block[0])
-            rows, factors, of_terms, _ = self._free(0 * unit, unit)
-            own_variance[block] = self._theta2 * np.einsum(
-                "kl,kl->l", rows, angular.solve(rows)
-            )
-            own_variance[block] += self._xy2 * np.einsum(
-                "vl,vw,wl->l", factors, self.cover.inverse, factors
-            )
-            own_variance[block] += np.einsum(
-                "pl,pq,ql->l", of_terms, self._of_terms, of_terms
-            )
-        variance = in_datum(
-            own_variance + self._of_means,
-            (),
-            self._spread(*datum)[1],
-            np.ones((count, 1)),
-            self.of(*datum),
-        )[0]
+        everywhere = np.ones((1, count))
+        mean = (system.known_lines / system.known_lines.sum())[:, None]
+        variance = self._variances(mean * everywhere, np.eye(count), turns, everywhere)
         return np.where(system.known_plate_lines, variance, np.nan)
+
+    def _variances(
+        self,
+        stage: np.ndarray,
+        plate: np.ndarray,
+        maps: tuple[np.ndarray, ...],
+        share: np.ndarray,
+    ) -> np.ndarray:
+        """Return the variances of functionals of the free maps, (K,).
+
+        Parameters
+        ----------
+        stage, plate : float array (K, K)
+            Factors of both angular maps.
+        maps : tuple of arrays
+            A few functionals of both XY maps, 1/m, by what is independent.
+        share : float array (k, K)
+            Share of each of the few in every functional.
+        """
+        noise, misalignments, of_terms = maps
+        variances = []
+        for start in range(0, self.angular.n_lines, BLOCK):
+            block = slice(start, start + BLOCK)
+            part = share[:, block]
+            shared = part.T @ noise @ part, misalignments @ part, of_terms @ part
+            variances += list(
+                self.of(stage[:, block], plate[:, block], shared).diagonal()
+            )
+        return np.maximum(variances, 0.0)
 
     def of(
         self,
         stage: np.ndarray,
         plate: np.ndarray,
-        maps: tuple[np.ndarray, np.ndarray] | None = None,
+        maps: tuple[np.ndarray, ...] | None = None,
     ) -> np.ndarray:
         """Return the covariance of functionals of the free maps, (k, k).
 
@@ -675,62 +663,23 @@ class LinesCovariance:
         ----------
         stage, plate : float array (K, k)
             Factors of both angular maps.
-        maps : tuple of complex array (sites, k) and (marks, k), optional
-            Factors of both XY maps in addition, 1/m.
-        """
-        rows, factors, of_terms, cov = self._free(stage, plate, maps)
-        cov = cov + self._theta2 * (rows.T @ self.angular.solve(rows))
-        cov += (plate.T * self._of_means) @ plate
-        cov += self._xy2 * (factors.T @ self.cover.inverse @ factors)
-        cov += of_terms.T @ self._of_terms @ of_terms
-        return (cov + cov.T) / 2
-
-    def _free(
-        self,
-        stage: np.ndarray,
-        plate: np.ndarray,
-        maps: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> tuple[np.ndarray, ...]:
-        """Return functionals as those of stage lines, misalignments, 1/m, and terms.
-
-        And the covariance of the part that is of sites and marks alone, (k, k), rad^2.
+        maps : tuple of arrays, optional
+            Functionals of both XY maps in addition, 1/m, by what is independent.
         """
         rows, of_rotations = self.angular.functionals(stage, plate)
         factors = np.zeros((self.system.size, rows.shape[1]))
         factors[self.system.phi_at] = of_rotations / self.cover.length
         of_terms = self.terms[0].T @ stage + self.terms[1].T @ plate
-        if maps is None:
-            return rows, factors, of_terms, np.zeros((rows.shape[1],) * 2)
-        noise, of_maps, terms_of_maps = self.cover.independent(*maps)
-        factors[: len(of_maps)] += of_maps
-        return rows, factors, of_terms + terms_of_maps, self._xy2 * noise
-
-    def _spread(
-        self, stage: np.ndarray, plate: np.ndarray, maps: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the covariance of functionals with both free maps, (K, k) each."""
-        rows, factors, of_terms, _ = self._free(stage, plate, maps)
-        coefficients = self._of_terms @ of_terms
-        phi = (
-            self._xy2
-            / self.cover.length
-            * (self.cover.inverse @ factors)[self.system.phi_at]
-        )
-        field = self._theta2 * self.angular.solve(rows) - self.angular.response @ phi
-        of_plate = self.angular.plate(np.zeros(1), field.T, phi.T)[0].T
-        of_plate += self._of_means[:, None] * plate
-        return field + self.terms[0] @ coefficients, of_plate + self.terms[
-            1
-        ] @ coefficients
-
-    @property
-    def _of_terms(self) -> np.ndarray:
-        """Covariance of the coefficients of the terms, (p, p)."""
-        return self.cover.terms.covariance * self._xy2
-
-    def _blocks(self) -> list[np.ndarray]:
-        n = self.angular.n_lines
-        return [np.arange(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
+        cov = self._theta2 * (rows.T @ self.angular.solve(rows))
+        cov += (plate.T * self._of_means) @ plate
+        if maps is not None:
+            noise, of_maps, terms_of_maps = maps
+            cov += self._xy2 * noise
+            factors[: len(of_maps)] += of_maps
+            of_terms = of_terms + terms_of_maps
+        cov += self._xy2 * (factors.T @ self.cover.inverse @ factors)
+        cov += self._xy2 * (of_terms.T @ self.cover.terms.covariance @ of_terms)
+        return (cov + cov.T) / 2
 
 
 def lines_alone(system: NormalEquations) -> LinesCovariance:
