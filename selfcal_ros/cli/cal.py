@@ -193,6 +193,10 @@ def _check(args: argparse.Namespace) -> int:
         },
     )
     refuse_errors(cal)
+    if args.gi4 and not any(isinstance(t, Table2D) and t.galvo for t in cal.tables):
+        raise InputError(
+            args.file, "it has no galvo table, which --gi4 is about", "leave --gi4 out"
+        )
     if args.strict and cal.findings:
         first = cal.findings[0]
         raise InputError(f"{args.file}:{first.line}", first.what, first.remedy)
