@@ -27,7 +27,10 @@ from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say
 from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
-from selfcal_ros.compensation.plausible import require_plausible
+from selfcal_ros.compensation.plausible import (
+    require_plausible,
+    require_plausible_line,
+)
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.model.result import CalibrationResult
@@ -335,6 +338,13 @@ def _orthogonality(args: argparse.Namespace) -> int:
             measured, ("--measured", "--over", "--travel"), strict=True
         )
     )
+    homes = [args.home] if args.home else list(_HOMES)
+    line_of = {
+        home: cal_lines.orthogonality(measured_m, over_m, travel_m, home)
+        for home in homes
+    }
+    if not args.steep:
+        require_plausible_line([0, over_m], [0, measured_m], "--measured")
     if args.output:
         if args.home is None:
             raise InputError(
@@ -342,13 +352,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
                 "the home position is missing",
                 "give end, middle or middle-balanced",
             )
-        line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
-        return _deliver(args, line, frame, (args.along, across))
-    homes = [args.home] if args.home else list(_HOMES)
-    line_of = {
-        home: cal_lines.orthogonality(measured_m, over_m, travel_m, home)
-        for home in homes
-    }
+        return _deliver(args, line_of[args.home], frame, (args.along, across))
     unit_m = UNITS_M[args.unit]
     tables = {
         home: [
@@ -385,6 +389,8 @@ def _line(args: argparse.Namespace) -> int:
         line = cal_lines.measured_line(
             read_text(args.source), args.source, frame.unit_m
         )
+        if not args.steep:
+            require_plausible_line(line.positions_m, line.corrections_m, args.source)
     else:
         result = read_result(args.source)
         if not args.steep:

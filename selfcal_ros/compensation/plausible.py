@@ -2,6 +2,7 @@
 """Ask whether a map is that of a stage, before a machine is corrected by it."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
@@ -39,3 +40,19 @@ def require_plausible(
                 f"{pitch_m * MM_PER_M:g} mm away: is it real?",
                 f"check the readings there; if it is, {accept}",
             )
+
+
+def require_plausible_line(
+    positions_m: ArrayLike, corrections_m: ArrayLike, where: str
+) -> None:
+    """Ask whether a step of measured values along an axis is real, as `require_plausible`."""
+    distances, steps = np.diff(positions_m), np.abs(np.diff(corrections_m))
+    most = int(np.argmax(steps / np.maximum(PLAUSIBLE * distances, PLAUSIBLE_M)))
+    distance, step = float(distances[most]), float(steps[most])
+    if step > max(PLAUSIBLE * distance, PLAUSIBLE_M):
+        raise InputError(
+            where,
+            f"the error changes by {step * UM_PER_M:.4g} µm within "
+            f"{distance * MM_PER_M:.4g} mm: is it real?",
+            "check the units; if it is, add --steep",
+        )

@@ -509,11 +509,32 @@ def test_a_table_of_a_map_without_uncertainty_says_so(run):
     assert not any("nan" in line for line in comments)
 
 
+def test_measured_errors_in_another_unit_are_asked_about(run, tmp_path):
+    """An error of 0.4 um over 10 mm given in nm, and a square with its units exchanged."""
+    (tmp_path / "nm.csv").write_text("position,error\n0,0\n10,400\n20,100\n")
+    for verb in ("accuracy", "straightness"):
+        code, _, err = run(verb, "nm.csv", "-o", "x.cal")
+        assert code == 2
+        one_line(err, "nm.csv: the error changes by 400 µm within 10 mm: is it real?")
+        assert not (tmp_path / "x.cal").exists()
+    assert run("accuracy", "nm.csv", "--steep", "-o", "x.cal")[0] == 0
+    square = ["--measured", "5mm", "--over", "200um", "--travel", "900mm"]
+    for more in ([], ["--home", "end", "-o", "y.cal"]):
+        code, _, err = run("orthogonality", *square, *more)
+        assert code == 2
+        one_line(err, "--measured: the error changes by 5000 µm within 0.2 mm")
+    assert run("orthogonality", *square, "--steep")[0] == 0
+
+
 def test_check_gi4(run, tmp_path):
     (tmp_path / "g.cal").write_text(
         ":GALVO2D 2 1 1 2 1024 1024 65\n" + ("0 " * 130 + "\n") * 65 + ":END\n"
     )
     assert run("check", "--gi4", "g.cal")[0] == 0
+    (tmp_path / "p.cal").write_text(":START2D 2 1 1 2 1 1 2\n0 0 0 0\n0 0 0 0\n:END\n")
+    assert run("check", "p.cal")[0] == 0
+    code, _, err = run("check", "--gi4", "p.cal")
+    assert code == 2 and "p.cal: it has no galvo table" in err
     code, _, err = run("check", "g.cal", "--gi4", "--scanner-bits", "20")
     assert code == 2
     one_line(err, "needs 16384, 1/64 of its range")
