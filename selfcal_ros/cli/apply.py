@@ -185,6 +185,10 @@ def read_points(text: str, where: str) -> np.ndarray:
                 f"not {len(head)} positions: '{','.join(cells):.60}'",
                 f"give {','.join(head)} {hint}in m and rad",
             )
+        if tuple(head) == ENDS and (points[index, :2] == points[index, 2:]).all():
+            raise InputError(
+                place, "the ends of the distance coincide", "give two points"
+            )
     if not len(points):
         raise InputError(where, "it has no points", "give at least one")
     if "theta" in head and (largest := np.abs(points[:, 2]).max()) > 2 * np.pi:

@@ -165,6 +165,10 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
         ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"),
         ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
         ("x,y\n1,z\n", "p.csv:2: not 2 positions"),
+        (
+            "x1,y1,x2,y2\n0,0,0.01,0\n0.01,0,0.01,0\n",
+            "p.csv:3: the ends of the distance coincide; give two points",
+        ),
         ("x,y\n1,1_0e-3\n", "p.csv:2: not 2 positions"),
         ("x,y\n1,٠.٠١\n", "p.csv:2: not 2 positions"),
     ],
