@@ -9,7 +9,7 @@ from typing import Any
 from selfcal_ros.applications.standards import iso230
 from selfcal_ros.applications.standards.iso230 import AxisFigures, PathFigures
 from selfcal_ros.apply import StageMap, load
-from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -118,6 +118,16 @@ def _read(args: argparse.Namespace) -> tuple[StageMap, Measurements | None]:
         raise InputError(
             f"{args.source} and {args.result}",
             "the plates differ",
+            "name the result of this bag",
+        )
+    elif (
+        stage.result.run_id != measurements.run_id
+        and "sha256" in stage.result.input
+        and stage.result.input["sha256"] != bag_input(args.source)["sha256"]
+    ):
+        raise InputError(
+            f"{args.source} and {args.result}",
+            "the result is of another recording",
             "name the result of this bag",
         )
     return stage, measurements

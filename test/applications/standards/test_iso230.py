@@ -410,6 +410,9 @@ def test_the_verb_takes_a_bag_or_a_result(tmp_path, capsys):
     assert main(["solve", bag, "--quiet", "-o", str(tmp_path / "r.json")]) == 0
     assert main(["iso230", bag, "--result", str(tmp_path / "r.json"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == of_bag
+    other = ["iso230", str(ROOT / "bags/demo"), "--result", str(tmp_path / "r.json")]
+    assert main(other) == 2  # the same plate, on another day
+    assert "the result is of another recording" in capsys.readouterr().err
     assert main(["iso230", str(tmp_path / "r.json"), "--json"]) == 0
     of_result = json.loads(capsys.readouterr().out)
     assert of_result["paths"] == of_bag["paths"]
