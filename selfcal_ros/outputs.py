@@ -376,6 +376,7 @@ def spelled_out(text: str) -> str:
 
 def can_print_symbols(stream: TextIO) -> bool:
     """Return whether the encoding of `stream` holds every symbol of a summary."""
+    stream = getattr(stream, "rich_proxied_file", stream)  # while a bar is drawn
     try:
         "".join(_ASCII).encode(getattr(stream, "encoding", None) or "ascii")
     except (UnicodeEncodeError, LookupError):

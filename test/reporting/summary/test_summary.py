@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
+from rich.file_proxy import FileProxy
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -563,6 +565,9 @@ def test_symbols_only_where_the_stream_has_them():
     assert can_print_symbols(io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
     assert not can_print_symbols(io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
     assert not can_print_symbols(io.StringIO())
+    utf8 = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    # while a bar is drawn, rich puts this in place of stderr
+    assert can_print_symbols(FileProxy(Console(file=utf8), utf8))
     assert to_ascii("φ ° 90° 2×3 ±1 µm ☃") == "phi deg 90 deg 2x3 +/-1 um ?"
 
 
