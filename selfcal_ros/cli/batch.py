@@ -10,6 +10,9 @@ from typing import Any
 
 from selfcal_ros.applications.batch.course import compared, sentence
 from selfcal_ros.applications.batch.folder import (
+    DATA,
+    PAGE,
+    TABLE,
     BatchJob,
     BatchSettings,
     Record,
@@ -111,15 +114,15 @@ def run(args: argparse.Namespace) -> int:
         if baseline is not None:
             lines += [sentence(records, args.baseline)]
         content = batch_json(records, series, before)
-        write_text(folder / "table.csv", csv_text(records))
-        write_text(folder / "index.html", page_html(records, series, lines))
-        write_json(folder / "batch.json", content)
+        write_text(folder / TABLE, csv_text(records))
+        write_text(folder / PAGE, page_html(records, series, lines))
+        write_json(folder / DATA, content)
     say(
         args,
         "\n".join(
             [
                 *map(printable, lines),
-                f"written: {folder / 'table.csv'}, index.html, batch.json",
+                f"written: {folder / TABLE}, {PAGE}, {DATA}",
             ]
         ),
         content,

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from selfcal_ros import __version__, portable
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_json
-from selfcal_ros.outputs import creating, sweep
+from selfcal_ros.outputs import creating, has_content, sweep
 from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 
 STORAGE = ".mcap"
@@ -30,6 +30,8 @@ NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "fra
 Record = dict[str, Any]
 """Record of a bag: JSON, schema `SCHEMA`, see docs/guides/batch.md."""
 LOCK = ".lock"
+TABLE, PAGE, DATA = WRITTEN = ("table.csv", "index.html", "batch.json")
+"""Files of a batch, which each one writes anew."""
 
 
 def find_bags(paths: Iterable[str]) -> list[Path]:
@@ -175,8 +177,17 @@ def opened(folder: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If it cannot be created, or another batch is using it.
+        If it cannot be created, another batch is using it, or a file in it that would be replaced
+        is not that of a batch.
     """
+    if not (folder / LOCK).exists():
+        for name in WRITTEN:
+            if has_content(folder / name):
+                raise InputError(
+                    str(folder / name),
+                    "the file exists, and is not that of a batch",
+                    "name another folder",
+                )
     with creating(folder):
         for part in (folder / RECORDS, folder / RESULTS):
             part.mkdir(parents=True, exist_ok=True)

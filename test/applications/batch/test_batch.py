@@ -65,6 +65,18 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / RESULTS).iterdir()}
 
 
+@pytest.mark.parametrize("name", ["table.csv", "index.html", "batch.json"])
+def test_files_that_are_not_of_a_batch_are_not_replaced(shelf, tmp_path, capsys, name):
+    (tmp_path / name).write_text("mine")
+    assert batch(shelf / "a.mcap", "-o", tmp_path, "--workers", 1) == 2
+    assert capsys.readouterr().err == (
+        f"selfcal batch: {tmp_path / name}: the file exists, and is not that of a batch; "
+        "name another folder\n"
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {name}
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(
     shelf, tmp_path, capsys
 ):
