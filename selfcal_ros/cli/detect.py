@@ -20,7 +20,7 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
-from selfcal_ros.outputs import write_bytes
+from selfcal_ros.outputs import creating, write_bytes
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
@@ -74,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--draw",
         metavar="FOLDER",
-        help="write each image there as PNG, with "
+        help="new folder: write each image there as PNG, with "
         "circles around what was found, squares and reasons around the rejected",
     )
     add_json(parser)
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)),
         max_marks=ANY_NUMBER,
     )
-    draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
+    draw = partial(_drawn, _empty(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or TYPED, draw)
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)
@@ -129,6 +129,26 @@ def _from_files(
     )
 
 
+def _empty(name: str) -> Path:
+    """Return a folder for pictures, created if it is not there.
+
+    Raises
+    ------
+    InputError
+        If it has files: those of the camera may have the same names.
+    """
+    folder = Path(name)
+    with creating(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
+        raise InputError(
+            name,
+            "has files, which pictures could replace",
+            "remove it or name another folder",
+        )
+    return folder
+
+
 def _drawn(
     folder: Path,
     settings: DetectorSettings,
@@ -138,7 +158,6 @@ def _drawn(
 ) -> None:
     """Write an image with what was found and what was rejected in it."""
     size = settings.mark_size / settings.pixel_size
-    folder.mkdir(parents=True, exist_ok=True)
     write_bytes(
         folder / f"{Path(name).stem}.png",
         circled(picture.values, judged, size),

@@ -644,7 +644,9 @@ def test_a_bag_none_of_whose_images_can_be_used_is_refused(bag, tmp_path, capsys
     assert "no image could be used: image: encoding 'yuv422'" in capsys.readouterr().err
 
 
-def test_images_are_drawn_with_what_was_found_and_what_was_rejected(bag, tmp_path):
+def test_images_are_drawn_with_what_was_found_and_what_was_rejected(
+    bag, tmp_path, capsys
+):
     """Green around a mark, red around a mark that a fibre crosses."""
 
     def dirty(number, message):
@@ -663,6 +665,10 @@ def test_images_are_drawn_with_what_was_found_and_what_was_rejected(bag, tmp_pat
     )
     pictures = sorted((tmp_path / "drawn").glob("*.png"))
     assert len(pictures) == 20
+    before = pictures[0].read_bytes()
+    assert detect(bag, tmp_path / "again", "--draw", str(tmp_path / "drawn")) == 2
+    assert "drawn: has files, which pictures could replace" in capsys.readouterr().err
+    assert pictures[0].read_bytes() == before and not (tmp_path / "again").exists()
     colours = []
     for picture in pictures[:2]:
         pixels = np.asarray(Image.open(picture)).reshape(-1, 3)
