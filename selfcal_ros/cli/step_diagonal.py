@@ -131,7 +131,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="replace an existing FILE.cal; the old one is kept with its date",
+        help="replace files that exist; an old FILE.cal is kept with its date",
     )
     add_frame(parser, theta=False)
     add_bag_options(parser)
@@ -196,13 +196,16 @@ def _check_outputs(args: argparse.Namespace) -> None:
     ):
         if path and not installed:
             raise InputError(option, "nothing would be written", remedy)
-    check_outputs(
-        [args.data, args.simulate],
-        [args.output, args.plot, args.cal, args.truth, args.save_csv],
-    )
-    if args.cal:
-        refuse_existing([args.cal], force=args.force)
-    else:
+    files = (args.output, args.plot, args.cal, args.truth, args.save_csv)
+    check_outputs([args.data, args.simulate], files)
+    refuse_existing(filter(None, [args.cal, args.truth]), force=args.force)
+    if args.force and not any(files):
+        raise InputError(
+            "--force",
+            "it replaces a file, and none is named",
+            "name one with -o, or omit it",
+        )
+    if not args.cal:
         _refuse_machine(args)
 
 
@@ -218,7 +221,6 @@ def _refuse_machine(args: argparse.Namespace) -> None:
             "home_y",
             "reverse_x",
             "reverse_y",
-            "force",
         ),
         "it belongs to a calibration file",
         "name one with --cal, or omit it",

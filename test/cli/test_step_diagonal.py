@@ -439,6 +439,18 @@ def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
     assert code == 2 and "the sign is wrong" in err
 
 
+def test_only_force_replaces_a_table_or_a_truth(tmp_path, capsys):
+    words = ["--simulate", CONFIG / "case_study.yaml"]
+    for option, name in (("-o", "d.csv"), ("--truth", "t.json")):
+        path = tmp_path / name
+        path.write_text("mine")
+        code, _, err = run(capsys, *words, option, path)
+        assert code == 2 and f"{path}: the file exists; name another file" in err
+        assert path.read_text() == "mine"
+        assert run(capsys, *words, option, path, "--force")[0] == 0
+        assert path.read_text() != "mine"
+
+
 def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
     table, truth = tmp_path / "d.csv", tmp_path / "t.json"
     assert (
