@@ -1051,14 +1051,14 @@ def _of_run(deviation: Deviation, kind: str, limit: float) -> dict[str, Any]:
 
 def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     """Return the verdict: enlarged if a run's U was, or if the runs differ by more than their U."""
-    enlarged: dict[str, Enlargement] = {}
+    enlarged: dict[tuple[str, str], Enlargement] = {}
     failed: list[Finding] = []
     for kind, mean in means.items():
         if mean.p_between < USUAL_LEVEL:
             u = np.sqrt(mean.between)
             name = BETWEEN + SUFFIX[kind]
             unit = KINDS[kind]
-            enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
+            enlarged[name, unit] = Enlargement(name, rms(u), float(u.max()), unit)
             failed.append(
                 BetweenRuns(
                     size=mean.u_between,
@@ -1070,9 +1070,10 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
             )
     for member in members:
         for item in member.result.verdict.enlarged_by if member.result else ():
-            before = enlarged.get(item.name)
-            if before is None or before.u_rms < item.u_rms:
-                enlarged[item.name] = item
+            before = enlarged.get((item.name, item.unit), item)
+            enlarged[item.name, item.unit] = max(
+                before, item, key=lambda one: one.u_rms
+            )
     of_runs = [
         member.name
         for member in members

@@ -218,7 +218,7 @@ class MapsCovariance:
         the misalignments, (3 views, k), and of the terms, (p, k).
         """
         grid = self.system.grid
-        of_terms = self._of_terms(g, a)
+        of_terms = self.of_terms(g, a)
         cov = np.real(a.conj().T @ (grid.noise_of_means[:, None] * a))
         g, misalignments = grid.functionals(g, a)
         cov += np.real(g.conj().T @ grid.solve(g))
@@ -269,11 +269,11 @@ class MapsCovariance:
             (self.terms.plates, True, self.system.known_marks),
         ):
             fields, g, a = self._datum(plate=plate)
-            of_coefficients = fields_of_terms + fields @ self._of_terms(g, a).T
+            of_coefficients = fields_of_terms + fields @ self.of_terms(g, a).T
             out.append(np.where(is_known.reshape(-1, 1), of_coefficients, 0.0))
         return out[0], out[1]
 
-    def _of_terms(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
+    def of_terms(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return functionals (sites, k), (marks, k) of free maps of the terms, (p, k)."""
         return np.real(self.terms.fields.conj().T @ g) + np.real(
             self.terms.plates.conj().T @ a
@@ -354,7 +354,7 @@ class MapsCovariance:
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
         """
         grid = self.system.grid
-        of_coefficients = -self.terms.covariance @ self._of_terms(g, a)
+        of_coefficients = -self.terms.covariance @ self.of_terms(g, a)
         g, misalignments = grid.functionals(g, a)
         parameters = self._p @ misalignments
         return grid.solve(g) - grid.response @ parameters, parameters, of_coefficients
@@ -592,6 +592,12 @@ class LinesCovariance:
         field = -self.cover.terms.turned
         phi = terms.parameters[self.system.phi_at] / self.cover.length
         return field, self.angular.plate(terms.lines, field.T, phi.T)[0].T
+
+    def stage_of_terms(self, conditions: Conditions) -> np.ndarray:
+        """Return Gtheta in its datum for a unit of each coefficient, (K, p)."""
+        free = self.terms[0]
+        slopes = self.cover.of_terms(*self.cover.functionals(conditions.slopes)[:2]).T
+        return free + conditions.gain @ (slopes - conditions.rows @ free)
 
     def of_stage(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""

@@ -9,7 +9,7 @@ that term were known, or to the free terms together.
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -48,7 +48,6 @@ from selfcal_ros.estimation.normal.equations import (
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     require_terms_determined,
@@ -246,7 +245,7 @@ MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 
 def saved_terms(
     cover: MapsCovariance,
-    columns: TermColumns,
+    roots: Iterable[tuple[str, np.ndarray]],
     sense: Sense,
     other_effects: dict[str, np.ndarray],
 ) -> Factors | None:
@@ -256,8 +255,8 @@ def saved_terms(
     ----------
     cover : MapsCovariance
         Of the map, in the frame of the equations, terms included.
-    columns : TermColumns
-        The terms.
+    roots : sequence of str and float array (p, k)
+        Names of the terms and roots of their parts of the coefficients' covariance.
     sense : Sense
         What moved: the factors are in the stage frame.
     other_effects : dict of float array (p, ...)
@@ -275,7 +274,7 @@ def saved_terms(
         [values.reshape(len(values), -1).T for values in other_effects.values()]
     )
     factors, names, beside_map, beside_alone, names_alone = [], [], [], [], []
-    for name, root in roots_by_term(cover.terms.covariance, columns):
+    for name, root in roots:
         directions, size, right = np.linalg.svd(coordinates @ root, full_matrices=False)
         significant = size > NEGLIGIBLE
         factors += list(
@@ -312,28 +311,25 @@ def factors_of(result: CalibrationResult) -> Factors:
 
 
 def angular_terms(
-    cover: MapsCovariance, columns: TermColumns, sense: Sense, sigma_m: float
+    turned: np.ndarray, roots: Iterable[tuple[str, np.ndarray]], *, least: float
 ) -> dict[str, np.ndarray]:
-    """Return the contribution of each term of the lines to u of the angular map, rad, (K,).
+    """Return the contributions of terms with a size to u of the angular map, rad, (K,).
 
     Parameters
     ----------
-    cover, columns, sense : MapsCovariance, TermColumns, Sense
-        As in `saved_terms`. The mean of the known lines is the datum.
-    sigma_m : float
-        Noise of one grid reading, m.
+    turned : float array (K, p)
+        Angular map for a unit of each coefficient, rad, by the noise of one grid reading.
+    roots : sequence of str and float array (p, k)
+        As in `saved_terms`.
+    least : float
+        Contribution that counts, rms, rad.
     """
-    u_of_terms = {}
-    for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
-        rows = columns.rows([name])
-        turned = cover.terms.turned[:, rows]
-        turned = turned - turned[cover.system.known_lines].mean(axis=0)
-        power = np.einsum(
-            "kp,pq,kq->k", turned, cover.terms.covariance[np.ix_(rows, rows)], turned
-        )
-        u = lines_turned_over(sense, np.sqrt(np.maximum(power, 0.0)), sign=1)
-        u_of_terms[str(name)] = rounded(u * sigma_m)
-    return u_of_terms
+    u_of_terms = (
+        (name, rounded(np.linalg.norm(turned @ root, axis=1)))
+        for name, root in roots
+        if name != FREE
+    )
+    return {name: u for name, u in u_of_terms if rms(u) > least}
 
 
 def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
@@ -726,23 +722,26 @@ def _error_map(
                         added=np.asarray(structured(model, cover, system.gauge.shear))
                     )
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
-        if with_uncertainty and problem.terms:
-            columns = model.equations.columns
-            kept_parts = replace(
-                kept_parts,
-                factors=saved_terms(
-                    cover,
-                    columns,
-                    measurements.sense,
-                    _beside_map(model, lines, measurements.sense),
-                ),
-                angular=angular_terms(
-                    cover, columns, measurements.sense, fitted.xy.sigma
-                ),
-            )
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if with_uncertainty else u_theta
+        if with_uncertainty and problem.terms:
+            roots = roots_by_term(cover.terms.covariance, model.equations.columns)
+            beside_map = _beside_map(model, lines, measurements.sense)
+            kept_parts = replace(
+                kept_parts,
+                factors=saved_terms(cover, roots, measurements.sense, beside_map),
+            )
+            if system.angular.n_views:
+                turned = lines.stage_of_terms(problem.conditions) * fitted.xy.sigma
+                of_lines = angular_terms(turned, roots, least=NEGLIGIBLE * rms(u_theta))
+                kept_parts = replace(
+                    kept_parts,
+                    angular={
+                        name: lines_turned_over(measurements.sense, u, sign=1)
+                        for name, u in of_lines.items()
+                    },
+                )
     known_sites = system.known_sites
     field = np.where(known_sites, fitted.field, complex(np.nan, np.nan))
     g_theta = np.where(system.known_lines, fitted.g_theta, np.nan)

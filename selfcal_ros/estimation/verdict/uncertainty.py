@@ -169,7 +169,8 @@ def enlargements(
 ) -> tuple[Enlargement, ...]:
     """Return the contributions of terms, by name, and effects to u, the largest first.
 
-    To u of the XY map, or of the angular map (rad) if only that changes.
+    To u of the XY map; of terms of lines, and of effects that change it alone, to that of the
+    angular map (rad).
     """
     variance = variance_of_terms(result)
     contributions = [
@@ -178,7 +179,7 @@ def enlargements(
         if (power := variance.get(name)) is not None
     ]
     for name in dict.fromkeys(names):
-        if name in result.kept.angular:
+        if name in result.kept.angular and block_of(name).of_lines:
             u = result.kept.angular[name]
             contributions.append(
                 Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad")

@@ -32,7 +32,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -316,9 +316,15 @@ def with_lines_seen_by(factor, terms, *, phi_rad=0.0, runs=4, recheck=False):
     return truth.g_theta - truth.g_theta.mean(), members
 
 
-def line_scales(runs):
-    """Return what the scale of the lines adds to the variance of theta, the mean over the runs."""
-    return np.mean([run.result.kept.angular["line_scale"] ** 2 for run in runs], axis=0)
+def of_scales(runs):
+    """Return what scales of lines and microscope add to the variance of theta, mean of the runs."""
+    return np.mean(
+        [
+            angular.get("microscope", 0.0) ** 2 + angular["line_scale"] ** 2
+            for angular in (run.result.kept.angular for run in runs)
+        ],
+        axis=0,
+    )
 
 
 def of_theta(run):
@@ -343,7 +349,7 @@ def test_a_scale_of_the_lines_that_is_assumed_does_not_average_out():
     emap, noise = found.result.error_map, found.result.noise
     assert np.mean(abs(emap.g_theta - truth) < noise.k_theta * emap.u_g_theta) > 0.9
     assert found.result.verdict.grade is Grade.GOOD
-    shared = line_scales(runs)
+    shared = of_scales(runs)
     np.testing.assert_allclose(
         found.theta.common, shared, rtol=0.01, atol=1e-3 * shared.max()
     )
@@ -360,7 +366,7 @@ def test_a_scale_of_the_lines_that_is_assumed_does_not_average_out():
 def test_of_two_scales_whose_difference_alone_is_seen_either_is_shared():
     """A plate turned by 1 mrad compares the lines with a microscope that is known to 1 %."""
     _, runs = with_lines_seen_by(1.0, ["microscope:0.01"], phi_rad=1e-3, runs=2)
-    shared = line_scales(runs)
+    shared = of_scales(runs)
     np.testing.assert_allclose(
         combine(runs).theta.common, shared, rtol=0.05, atol=0.01 * shared.max()
     )
@@ -401,6 +407,14 @@ def test_an_assumed_approach_is_shared_by_all_runs():
         found.xy.common, shared, rtol=0.05, atol=0.01 * shared.max()
     )
     np.testing.assert_allclose(found.xy.within, combine(thrice(A)).xy.within, rtol=0.05)
+
+
+def test_what_enlarged_both_maps_of_a_run_is_named_of_both():
+    of_map = Enlargement("line_scale", 1e-8, 2e-8)
+    of_lines = Enlargement("line_scale", 1e-6, 2e-6, "rad")
+    verdict = Verdict(Grade.ENLARGED, enlarged_by=(of_map, of_lines))
+    found = combine(thrice(replace(A, verdict=verdict))).result
+    assert found.verdict.enlarged_by == (of_map, of_lines)
 
 
 def test_a_reference_length_is_kept_once():

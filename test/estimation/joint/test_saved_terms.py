@@ -6,9 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.joint.solve import saved_terms
+from selfcal_ros.estimation.datum.covariance import LinesCovariance, MapsCovariance
+from selfcal_ros.estimation.joint.solve import saved_terms, solve_joint
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.estimation.terms.equations import roots_by_term
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense, lines_turned_over
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.machine import Spread, random_truth
+from test.support.truth import hu_plan, simulate_measurements
 
 SIGMA = 3.0
 """Standard deviation of the one coefficient, in units of the noise of a reading."""
@@ -20,7 +28,6 @@ def cover_of(field, known):
     return SimpleNamespace(
         system=SimpleNamespace(grid=grid),
         maps_of_terms=lambda: (np.where(known, field, 0.0).reshape(-1, 1), None),
-        terms=SimpleNamespace(covariance=np.array([[SIGMA**2]])),
     )
 
 
@@ -35,11 +42,12 @@ def kept(shape, sense=Sense.MICROSCOPE_MOVES, size=float("inf")):
         WithinMarks(np.zeros((1, 1)), np.zeros(1), 0.0, 0),
         [],
     )
+    roots = roots_by_term(np.array([[SIGMA**2]]), columns)
     return (
         field,
         known,
         saved_terms(
-            cover_of(field, known), columns, sense, {"microscope": np.zeros((1, 4))}
+            cover_of(field, known), roots, sense, {"microscope": np.zeros((1, 4))}
         ),
     )
 
@@ -78,3 +86,28 @@ def test_a_factor_is_what_a_standard_deviation_of_the_coefficient_does_to_the_ma
     turned = factor[0] + 1j * factor[1]
     sign = np.sign((turned * moved.conj()).sum().real)  # L L' is the same for -L
     assert turned == pytest.approx(sign * moved, rel=1e-6)
+
+
+@pytest.mark.parametrize("datum", ThetaDatum)
+@pytest.mark.parametrize("sense", Sense)
+def test_what_terms_and_noise_are_in_u_of_the_angular_map_adds_up(sense, datum):
+    """A microscope and the offsets of lines are shown by the same rotations: not told apart."""
+    artifact, rng = Artifact(5, 0.01, 24), np.random.default_rng(3)
+    plan, settings = hu_plan(artifact, 4), CellSettings(sense, 2e-8, 2e-6)
+    truth = random_truth(artifact, len(plan.views), rng, Spread(phi_rad=1e-3))
+    readings = simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    solved = solve_joint(readings, Options(datum_theta=datum))
+    problem, fitted = solved.joint.problem, solved.joint.fitted
+    lines = LinesCovariance(
+        MapsCovariance(
+            problem.system, fitted.inverse, half_width_m=problem.half_width_m
+        ),
+        (fitted.xy.sigma, fitted.theta.sigma),
+    )
+    of_noise = lines.of_stage(problem.conditions)[0]
+    parts = solved.result.kept.angular
+    assert {"microscope", "line_eccentricity", "line_scale"} <= set(parts)
+    of_terms = sum(u**2 for u in parts.values())
+    assert solved.result.error_map.u_g_theta**2 == pytest.approx(
+        of_terms + lines_turned_over(sense, of_noise, sign=1), rel=1e-5
+    )

@@ -112,10 +112,9 @@ def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles(monkeypat
         measured(settings=settings), Options(terms=parse_terms(["microscope"], ""))
     )
     u2 = np.mean(result.error_map.u_g_theta**2)
-    assumed = sum(
-        np.mean(np.square(result.kept.angular[name]))
-        for name in ("line_eccentricity", "line_scale")
-    )
+    parts = result.kept.angular
+    assert {"line_eccentricity", "line_scale"} < set(parts)
+    assumed = sum(np.mean(u**2) for u in parts.values())
     dof = result.noise.dof_theta * (u2 / (u2 - assumed)) ** 2
     assert 0.01 < assumed / u2 < 1
     assert result.noise.dof_map_theta == pytest.approx(dof, rel=1e-9)
