@@ -61,13 +61,15 @@ determine fully is ignored."""
 
 
 @dataclass(eq=False)
-class SearchResult:
-    """Causes that were found, and the solution that allows for them.
+class Search:
+    """A search for causes: what was found, and the solution that allows for it.
 
     Attributes
     ----------
     solved : Solved
         The solution with the terms that the readings show.
+    measurements, options : Measurements, Options
+        Its readings, and how they were solved.
     causes : list of Cause
         The most likely first.
     effects : list of Effect
@@ -79,10 +81,324 @@ class SearchResult:
     """
 
     solved: Solved
+    measurements: Measurements
+    options: Options
     causes: list[Cause] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
     terms: list[str] = field(default_factory=list)
     bounded: bool = True
+
+    def add_shown(self, *, failed: bool) -> None:
+        """Add terms while the readings show any; then bound the effects of all other causes."""
+        explanations: list[Explanation] = []
+        for _ in range(MAX_CAUSES + 1):
+            explanations = _explanations(self.solved, failed=failed)
+            first = [
+                item
+                for item in explanations
+                if item.rank == 0 and item.name in blocks()
+            ]
+            if not first or not self._join(first):
+                break
+            failed = False
+        for item in explanations:
+            self._bound(item)
+        if (line := line_cause(self.solved.joint, self.measurements)) is not None:
+            self.causes.append(line)
+            lines = self.measurements.artifact.angular_count
+            most = abs(line.size) / np.sqrt(max(lines, 1))  # the error of a reading
+            self.effects.append(
+                Effect(
+                    line.name,
+                    np.zeros((2, *self.measurements.artifact.field.shape)),
+                    np.full(lines, most),
+                )
+            )
+        if not self.causes:
+            self._noisy_views()
+
+    def _join(self, first: list[Explanation]) -> bool:
+        """Add the first of equally good explanations to the model; the others enlarge u.
+
+        Return whether it joined.
+        """
+        inputs = self.solved.joint.problem.inputs
+        names = [*self.terms, first[0].name]
+        solved = self.solved_with([_hardly(n) for n in names])
+        if solved is None or not any(
+            test.name == first[0].name and test.contradicted
+            for test in solved.joint.sizes
+        ):
+            return False
+        for alternative in first[1:]:
+            twin = self.solved_with(
+                [_hardly(n) for n in (*self.terms, alternative.name)]
+            )
+            if twin is not None:
+                self.effects.append(
+                    difference(alternative.name, twin.result, solved.result)
+                )
+        self.causes += [cause_of(item, inputs) for item in first]
+        self.solved, self.terms = solved, names
+        self.causes[-len(first)] = cause_of(
+            fitted_term(
+                solved.joint, first[0].name, first[0].p, determined=first[0].determined
+            ),
+            inputs,
+        )
+        return True
+
+    def _bound(self, item: Explanation) -> None:
+        """Add a cause outside the model, with its effect on the map as far as determined."""
+        model = self.solved.joint
+        cause = cause_of(item, model.problem.inputs)
+        if (
+            cause.name in [named.name for named in self.causes]
+            and cause.name in blocks()
+        ):
+            return
+        self.causes.append(cause)
+        self.bounded &= item.determined
+        if item.map_change is not None and item.angle_change is not None:
+            field = item.map_change.reshape(model.problem.system.grid.views.shape)
+            self.effects.append(
+                effect_of_field(
+                    item.name, field, self.measurements.sense, item.angle_change
+                )
+            )
+
+    def _noisy_views(self) -> None:
+        """Add the views whose visits scatter more than those of the others.
+
+        A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
+        """
+        views = scatter_of_views(self.measurements, self.solved.joint)
+        emap = self.solved.result.error_map
+        noisy = noisier_views(views)
+        largest = max(
+            (sigma for name, sigma, _ in views if name in [c.view for c in noisy]),
+            default=0,
+        )
+        if (ratio := largest / self.solved.xy.sigma) > 1:
+            plate = self.solved.result.artifact_map
+            more = np.sqrt(ratio**2 - 1)
+            on_plate = None
+            if plate.u_ax.size:
+                on_plate = more * np.nan_to_num(np.stack([plate.u_ax, plate.u_ay]))
+            self.effects.append(
+                Effect(
+                    NOISE,
+                    more * np.nan_to_num(emap.u_xy),
+                    np.zeros(len(emap.g_theta)),
+                    on_plate,
+                )
+            )
+        self.causes += sorted(noisy, key=lambda cause: cause.p)
+
+    def add_raised_sizes(self) -> tuple[list[str], bool]:
+        """Put the terms first whose sizes the readings contradict, or that are not plausible.
+
+        Return their names, and whether something else explains the readings as well as one of them.
+        """
+        solved = self.solved
+        raised = {
+            str(test.name): _raised_cause(solved, test)
+            for test in solved.joint.sizes
+            if (test.contradicted or not _is_plausible(test))
+            and test.name not in self.terms
+        }
+        scales = (
+            self._either_scale()
+            if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
+            else {}
+        )
+        raised = scales | {
+            name: cause for name, cause in raised.items() if name not in scales
+        }
+        self.bounded &= not any(_beyond_u(solved, test) for test in solved.joint.sizes)
+        between = any(block_of(name).between for name in raised)
+        alike = bool(scales) or (between and self._as_a_microscope())
+        self.causes[:0] = [cause for cause in raised.values() if cause is not None]
+        names = [name for name, cause in raised.items() if cause is not None]
+        self._allow_for_plates(names)
+        return names, alike
+
+    def _either_scale(self) -> dict[str, Cause | None]:
+        """Return the scales of the offsets of marks and of lines as causes, each as the only one.
+
+        Nothing if not each by itself explains what the readings show.
+        """
+        causes: dict[str, Cause | None] = {}
+        for term in self.solved.joint.given:
+            if term.block.of_offsets and not term.free:
+                twin = self._with_wide(term)
+                if twin is None:
+                    return {}
+                cause = cause_of(
+                    fitted_term(twin.joint, term.name), twin.joint.problem.inputs
+                )
+                causes[str(term.name)] = replace(
+                    cause, details=replace(cause.details, either=True)
+                )
+        return causes if len(causes) > 1 else {}
+
+    def _with_wide(self, microscope: ModelTerm) -> Solved | None:
+        """Return the solution with a term so wide that it need not share what it explains.
+
+        None if there is none, or the readings contradict another size.
+        """
+        wider = microscope.scaled(
+            max(BEYOND * microscope.block.plausible / microscope.size, 1.0)
+        )
+        twin = self.solved_with([wider])
+        contradicted = twin is None or any(
+            test.contradicted for test in twin.joint.sizes
+        )
+        return None if contradicted else twin
+
+    def _as_a_microscope(self) -> bool:
+        """Return whether a microscope of another scale explains the rotation of lines equally well.
+
+        If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
+        """
+        microscope = next(
+            (
+                term
+                for term in self.options.model_terms(visits=True)
+                if term.block.of_microscope and not term.free
+            ),
+            None,
+        )
+        twin = self._with_wide(microscope) if microscope else None
+        if microscope is None or twin is None:
+            return False
+        fitted = fitted_term(twin.joint, microscope.name)
+        effect = difference(str(microscope.name), twin.result, self.solved.result)
+        if not _counts(
+            replace(fitted, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
+            self.solved,
+        ):
+            return False
+        cause = cause_of(fitted, twin.joint.problem.inputs)
+        self.causes.append(cause)
+        self.effects.append(effect)
+        self.bounded &= not abs(cause.size) > max(
+            microscope.size, microscope.block.plausible
+        )
+        return True
+
+    def _allow_for_plates(self, raised: Collection[str]) -> None:
+        """Add plates that differ as causes beside scales of offsets that explain no more.
+
+        Scales of marks and lines that are wrong alike make a plate seem to shrink by E phi^2: where
+        a plate lies turned by mrad, it may have grown instead.
+        """
+        for name in raised:
+            if not (block_of(name).of_lines and block_of(name).of_offsets):
+                continue
+            twin = self.solved_with([ModelTerm(name, 0.0)])
+            if twin is None:
+                continue
+            contradicted = [test for test in twin.joint.sizes if test.contradicted]
+            plausible = [
+                test
+                for test in contradicted
+                if block_of(test.name).of_plate and _is_plausible(test)
+            ]
+            if not contradicted or plausible != contradicted:
+                continue
+            self.causes += filter(
+                None, (_raised_cause(twin, test) for test in contradicted)
+            )
+            self.effects.append(difference(name, twin.result, self.solved.result))
+
+    def add_turned_lines(self) -> Cause | None:
+        """Add that lines turn against marks as plates do, and return it; None if they do not."""
+        solved = self.solved
+        turned = turned_too_far(solved.joint, solved.result, self.measurements)
+        if turned is not None:
+            self.bounded = False
+            if turned.name not in [cause.name for cause in self.causes]:
+                self.causes.append(turned)
+        return turned
+
+    def add_roughness(self, *, advise: bool) -> None:
+        """Add what maps with nodes of their own do not follow, of marks and of lines."""
+        model = self.solved.joint
+        for rough in filter(None, (adequacy_of(model), line_adequacy_of(model))):
+            self.effects.append(rough.effect(self.solved.result))
+            if (cause := rough.cause) is None:
+                continue
+            nodes = ""
+            if advise and not rough.of_lines:
+                nodes = self._better_map()
+            remedies = (Remedy("map", nodes),) if nodes else ()
+            self.causes.append(replace(cause, remedies=remedies))
+
+    def _better_map(self) -> str:
+        """Return the first map (--map) with which nothing contradicts the readings; else empty."""
+        return next(
+            (
+                text
+                for text, readings in maps_to_try(self.measurements)
+                if _uncontradicted(readings, self.options)
+            ),
+            "",
+        )
+
+    def add_reversal(self) -> None:
+        """Add a reversal that differs from site to site, if it matters for the map."""
+        result = self.solved.result
+        reversal = reversal_of(self.solved.joint)
+        if reversal is None:
+            return
+        effect = reversal.effect(result)
+        if rms(effect.xy) > MATTERS * rms(result.error_map.u_xy):
+            self.effects.append(effect)
+            self.causes.append(reversal.cause(effect))
+
+    def add_off_sites(self, off_sites: OffSites) -> None:
+        """Add a stage off the sites: first if residuals show it, too."""
+        place = 0 if off_sites.residuals_show_it else len(self.causes)
+        self.causes.insert(place, off_sites.cause)
+        lines = np.zeros(self.measurements.artifact.angular_count)
+        self.effects.append(
+            effect_of_field(
+                off_sites.cause.name,
+                off_sites.map_change,
+                self.measurements.sense,
+                lines,
+            )
+        )
+        self.bounded &= off_sites.bounded
+
+    def best_model(self) -> str | None:
+        """Return the model with which these readings give a good map; None if there is none.
+
+        Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
+        contradicts them, the one with the smaller uncertainty.
+        """
+        terms_used = {term.name: term for term in self.solved.joint.problem.terms}
+        best = None
+        least = np.inf
+        for free in (True, False):
+            terms = [
+                ModelTerm(name) if free else terms_used[name].rounded_up
+                for name in self.terms
+            ]
+            tried = replace(self.options, terms=merged(self.options.terms, terms))
+            if (solved := _uncontradicted(self.measurements, tried)) is not None:
+                emap = solved.result.error_map
+                u = rms(emap.u_xy) + np.nan_to_num(rms(emap.u_g_theta))
+                if u < least:
+                    best = ",".join(map(str, tried.terms))
+                    least = u
+        return best
+
+    def solved_with(self, terms: Collection[ModelTerm]) -> Solved | None:
+        """Return the solution with further terms; None if there is none."""
+        more = merged(self.options.terms, terms)
+        return _solved(self.measurements, replace(self.options, terms=more))
 
 
 def search_causes(
@@ -92,7 +408,7 @@ def search_causes(
     *,
     failed: bool,
     advise: bool = True,
-) -> SearchResult:
+) -> Search:
     """Search the residuals for effects that are not in the model.
 
     Parameters
@@ -106,7 +422,7 @@ def search_causes(
     advise : bool
         Whether remedies are tried.
     """
-    search = SearchResult(solved)
+    search = Search(solved, measurements, options)
     if options.causes is False or solved.model is None:
         return search
     contradicted = any(test.contradicted for test in solved.model.sizes)
@@ -118,14 +434,14 @@ def search_causes(
     failed = failed or contradicted or off_sites is not None
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
-        _search(search, measurements, options, failed=failed)
+        search.add_shown(failed=failed)
 
-    raised, alike = _add_raised_sizes(search, measurements, options)
-    turned = _add_turned_lines(search, measurements)
-    _add_roughness(search, measurements, options, advise=advise)
-    _add_reversal(search)
+    raised, alike = search.add_raised_sizes()
+    turned = search.add_turned_lines()
+    search.add_roughness(advise=advise)
+    search.add_reversal()
     if off_sites is not None:
-        _add_off_sites(search, off_sites, measurements)
+        search.add_off_sites(off_sites)
     plausible = all(map(_is_plausible, search.solved.joint.sizes))
     search.bounded &= plausible
     search.solved = _from_readings(search.solved, search.terms)
@@ -133,7 +449,7 @@ def search_causes(
 
     if advise and search.causes:
         tried = search.terms and plausible and not alike
-        model = _best_model(search, measurements, options) if tried else None
+        model = search.best_model() if tried else None
         faulty = (
             *(name for name, block in blocks().items() if block.of_time),
             READING,
@@ -145,108 +461,9 @@ def search_causes(
     return search
 
 
-def _add_raised_sizes(
-    search: SearchResult, measurements: Measurements, options: Options
-) -> tuple[list[str], bool]:
-    """Put the terms first whose sizes the readings contradict, or that are not plausible.
-
-    Return their names, and whether something else explains the readings as well as one of them.
-    """
-    solved = search.solved
-    raised = {
-        str(test.name): _raised_cause(solved, test)
-        for test in solved.joint.sizes
-        if (test.contradicted or not _is_plausible(test))
-        and test.name not in search.terms
-    }
-    scales = (
-        _either_scale(solved, measurements, options)
-        if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
-        else {}
-    )
-    raised = scales | {
-        name: cause for name, cause in raised.items() if name not in scales
-    }
-    search.bounded &= not any(_beyond_u(solved, test) for test in solved.joint.sizes)
-    between = any(block_of(name).between for name in raised)
-    alike = bool(scales) or (
-        between and _as_a_microscope(search, measurements, options)
-    )
-    search.causes[:0] = [cause for cause in raised.values() if cause is not None]
-    names = [name for name, cause in raised.items() if cause is not None]
-    _allow_for_plates(search, names, measurements, options)
-    return names, alike
-
-
-def _add_turned_lines(search: SearchResult, measurements: Measurements) -> Cause | None:
-    """Add that lines turn against marks as plates do, and return it; None if they do not."""
-    solved = search.solved
-    turned = turned_too_far(solved.joint, solved.result, measurements)
-    if turned is not None:
-        search.bounded = False
-        if turned.name not in [cause.name for cause in search.causes]:
-            search.causes.append(turned)
-    return turned
-
-
-def _add_roughness(
-    search: SearchResult, measurements: Measurements, options: Options, *, advise: bool
-) -> None:
-    """Add what maps with nodes of their own do not follow, of marks and of lines."""
-    model = search.solved.joint
-    for rough in filter(None, (adequacy_of(model), line_adequacy_of(model))):
-        search.effects.append(rough.effect(search.solved.result))
-        if (cause := rough.cause) is None:
-            continue
-        nodes = ""
-        if advise and not rough.of_lines:
-            nodes = _better_map(measurements, options)
-        remedies = (Remedy("map", nodes),) if nodes else ()
-        search.causes.append(replace(cause, remedies=remedies))
-
-
-def _add_reversal(search: SearchResult) -> None:
-    """Add a reversal that differs from site to site, if it matters for the map."""
-    result = search.solved.result
-    reversal = reversal_of(search.solved.joint)
-    if reversal is None:
-        return
-    effect = reversal.effect(result)
-    if rms(effect.xy) > MATTERS * rms(result.error_map.u_xy):
-        search.effects.append(effect)
-        search.causes.append(reversal.cause(effect))
-
-
-def _add_off_sites(
-    search: SearchResult, off_sites: OffSites, measurements: Measurements
-) -> None:
-    """Add a stage off the sites: first if residuals show it, too."""
-    place = 0 if off_sites.residuals_show_it else len(search.causes)
-    search.causes.insert(place, off_sites.cause)
-    lines = np.zeros(measurements.artifact.angular_count)
-    search.effects.append(
-        effect_of_field(
-            off_sites.cause.name, off_sites.map_change, measurements.sense, lines
-        )
-    )
-    search.bounded &= off_sites.bounded
-
-
-def _better_map(measurements: Measurements, options: Options) -> str:
-    """Return the first map (--map) with which nothing contradicts these readings; else empty."""
-    return next(
-        (
-            text
-            for text, readings in maps_to_try(measurements)
-            if _uncontradicted(readings, options)
-        ),
-        "",
-    )
-
-
 def _uncontradicted(measurements: Measurements, options: Options) -> Solved | None:
     """Return the solution of a model that nothing contradicts; None if it is not."""
-    solved = solved_with(measurements, options, ())
+    solved = _solved(measurements, options)
     if solved is None or solved.xy.contradicted or solved.theta.contradicted:
         return None
     again = search_causes(solved, measurements, options, failed=False, advise=False)
@@ -266,32 +483,6 @@ def _advised(
     if cause.view and cause.name not in faulty:
         remedies.append(Remedy("view", cause.view))
     return replace(cause, remedies=tuple(remedies))
-
-
-def _best_model(
-    searched: SearchResult, measurements: Measurements, options: Options
-) -> str | None:
-    """Return the model with which these readings give a good map; None if there is none.
-
-    Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
-    contradicts them, the one with the smaller uncertainty.
-    """
-    terms_used = {term.name: term for term in searched.solved.joint.problem.terms}
-    best = None
-    least = np.inf
-    for free in (True, False):
-        terms = [
-            ModelTerm(name) if free else terms_used[name].rounded_up
-            for name in searched.terms
-        ]
-        tried = replace(options, terms=merged(options.terms, terms))
-        if (solved := _uncontradicted(measurements, tried)) is not None:
-            emap = solved.result.error_map
-            u = rms(emap.u_xy) + np.nan_to_num(rms(emap.u_g_theta))
-            if u < least:
-                best = ",".join(map(str, tried.terms))
-                least = u
-    return best
 
 
 def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
@@ -327,35 +518,6 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
     return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
 
-def _search(
-    search: SearchResult, measurements: Measurements, options: Options, *, failed: bool
-) -> None:
-    """Add terms while the readings show any; then bound the effects of all other causes."""
-    explanations: list[Explanation] = []
-    for _ in range(MAX_CAUSES + 1):
-        explanations = _explanations(search.solved, failed=failed)
-        first = [
-            item for item in explanations if item.rank == 0 and item.name in blocks()
-        ]
-        if not first or not _join(search, first, measurements, options):
-            break
-        failed = False
-    for item in explanations:
-        _bound(search, item, measurements)
-    if (line := line_cause(search.solved.joint, measurements)) is not None:
-        search.causes.append(line)
-        lines = measurements.artifact.angular_count  # the error of a reading at most
-        search.effects.append(
-            Effect(
-                line.name,
-                np.zeros((2, *measurements.artifact.field.shape)),
-                np.full(lines, abs(line.size) / np.sqrt(max(lines, 1))),
-            )
-        )
-    if not search.causes:
-        _noisy_views(search, measurements)
-
-
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
     model = solved.joint
@@ -387,14 +549,10 @@ def _counts(explanation: Explanation, solved: Solved) -> bool:
     ) or explanation.effect_rad > MATTERS * rms(emap.u_g_theta)
 
 
-def solved_with(
-    measurements: Measurements, options: Options, terms: Collection[ModelTerm]
-) -> Solved | None:
-    """Return the solution with further terms; None if there is none."""
+def _solved(measurements: Measurements, options: Options) -> Solved | None:
+    """Return the solution; None if there is none."""
     try:
-        return solve_joint(
-            measurements, replace(options, terms=merged(options.terms, terms))
-        )
+        return solve_joint(measurements, options)
     except (NotIdentifiableError, InputError):
         return None
 
@@ -402,44 +560,6 @@ def solved_with(
 def _hardly(name: str) -> ModelTerm:
     """Return a term of a size that readings which show it contradict."""
     return ModelTerm(name, block_of(name).undetected)
-
-
-def _join(
-    search: SearchResult,
-    first: list[Explanation],
-    measurements: Measurements,
-    options: Options,
-) -> bool:
-    """Add the first of equally good explanations to the model; the others enlarge u.
-
-    Return whether it joined.
-    """
-    inputs = search.solved.joint.problem.inputs
-    names = [*search.terms, first[0].name]
-    solved = solved_with(measurements, options, [_hardly(n) for n in names])
-    if solved is None or not any(
-        test.name == first[0].name and test.contradicted for test in solved.joint.sizes
-    ):
-        return False
-    for alternative in first[1:]:
-        twin = solved_with(
-            measurements,
-            options,
-            [_hardly(n) for n in (*search.terms, alternative.name)],
-        )
-        if twin is not None:
-            search.effects.append(
-                difference(alternative.name, twin.result, solved.result)
-            )
-    search.causes += [cause_of(item, inputs) for item in first]
-    search.solved, search.terms = solved, names
-    search.causes[-len(first)] = cause_of(
-        fitted_term(
-            solved.joint, first[0].name, first[0].p, determined=first[0].determined
-        ),
-        inputs,
-    )
-    return True
 
 
 def _is_plausible(test: SizeTest) -> bool:
@@ -508,149 +628,3 @@ def _effect_of(
         enlargements(solved.result, [term.name], []),
         {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)},
     )
-
-
-def _allow_for_plates(
-    search: SearchResult,
-    raised: Collection[str],
-    measurements: Measurements,
-    options: Options,
-) -> None:
-    """Add plates that differ as causes beside scales of offsets that explain no more than they do.
-
-    Scales of marks and lines that are wrong alike make a plate seem to shrink by E phi^2: where a
-    plate lies turned by mrad, it may have grown instead.
-    """
-    for name in raised:
-        if not (block_of(name).of_lines and block_of(name).of_offsets):
-            continue
-        twin = solved_with(measurements, options, [ModelTerm(name, 0.0)])
-        if twin is None:
-            continue
-        contradicted = [test for test in twin.joint.sizes if test.contradicted]
-        plausible = [
-            test
-            for test in contradicted
-            if block_of(test.name).of_plate and _is_plausible(test)
-        ]
-        if not contradicted or plausible != contradicted:
-            continue
-        search.causes += filter(
-            None, (_raised_cause(twin, test) for test in contradicted)
-        )
-        search.effects.append(difference(name, twin.result, search.solved.result))
-
-
-def _as_a_microscope(
-    search: SearchResult, measurements: Measurements, options: Options
-) -> bool:
-    """Return whether a microscope of another scale explains the rotation of lines equally well.
-
-    If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
-    """
-    microscope = next(
-        (
-            term
-            for term in options.model_terms(visits=True)
-            if term.block.of_microscope and not term.free
-        ),
-        None,
-    )
-    twin = _with_wide(microscope, measurements, options) if microscope else None
-    if microscope is None or twin is None:
-        return False
-    fitted = fitted_term(twin.joint, microscope.name)
-    effect = difference(str(microscope.name), twin.result, search.solved.result)
-    if not _counts(
-        replace(fitted, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
-        search.solved,
-    ):
-        return False
-    cause = cause_of(fitted, twin.joint.problem.inputs)
-    search.causes.append(cause)
-    search.effects.append(effect)
-    search.bounded &= not abs(cause.size) > max(
-        microscope.size, microscope.block.plausible
-    )
-    return True
-
-
-def _bound(search: SearchResult, item: Explanation, measurements: Measurements) -> None:
-    """Add a cause outside the model, with its effect on the map as far as determined."""
-    model = search.solved.joint
-    cause = cause_of(item, model.problem.inputs)
-    if cause.name in [named.name for named in search.causes] and cause.name in blocks():
-        return
-    search.causes.append(cause)
-    search.bounded &= item.determined
-    if item.map_change is not None and item.angle_change is not None:
-        field = item.map_change.reshape(model.problem.system.grid.views.shape)
-        search.effects.append(
-            effect_of_field(item.name, field, measurements.sense, item.angle_change)
-        )
-
-
-def _noisy_views(search: SearchResult, measurements: Measurements) -> None:
-    """Add the views whose visits scatter more than those of the others.
-
-    A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
-    """
-    views = scatter_of_views(measurements, search.solved.joint)
-    emap = search.solved.result.error_map
-    noisy = noisier_views(views)
-    largest = max(
-        (sigma for name, sigma, _ in views if name in [c.view for c in noisy]),
-        default=0,
-    )
-    if (ratio := largest / search.solved.xy.sigma) > 1:
-        plate = search.solved.result.artifact_map
-        more = np.sqrt(ratio**2 - 1)
-        on_plate = None
-        if plate.u_ax.size:
-            on_plate = more * np.nan_to_num(np.stack([plate.u_ax, plate.u_ay]))
-        search.effects.append(
-            Effect(
-                NOISE,
-                more * np.nan_to_num(emap.u_xy),
-                np.zeros(len(emap.g_theta)),
-                on_plate,
-            )
-        )
-    search.causes += sorted(noisy, key=lambda cause: cause.p)
-
-
-def _with_wide(
-    microscope: ModelTerm, measurements: Measurements, options: Options
-) -> Solved | None:
-    """Return the solution with a term so wide that it need not share what it explains by itself.
-
-    None if there is none, or the readings contradict another size.
-    """
-    wider = microscope.scaled(
-        max(BEYOND * microscope.block.plausible / microscope.size, 1.0)
-    )
-    twin = solved_with(measurements, options, [wider])
-    contradicted = twin is None or any(test.contradicted for test in twin.joint.sizes)
-    return None if contradicted else twin
-
-
-def _either_scale(
-    solved: Solved, measurements: Measurements, options: Options
-) -> dict[str, Cause | None]:
-    """Return the scales of the offsets of marks and of lines as causes, each as the only one.
-
-    Nothing if not each by itself explains what the readings show.
-    """
-    causes: dict[str, Cause | None] = {}
-    for term in solved.joint.given:
-        if term.block.of_offsets and not term.free:
-            twin = _with_wide(term, measurements, options)
-            if twin is None:
-                return {}
-            cause = cause_of(
-                fitted_term(twin.joint, term.name), twin.joint.problem.inputs
-            )
-            causes[str(term.name)] = replace(
-                cause, details=replace(cause.details, either=True)
-            )
-    return causes if len(causes) > 1 else {}

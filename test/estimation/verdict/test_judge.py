@@ -119,7 +119,7 @@ def test_a_search_needs_a_field_that_is_not_large_and_noise(
     searched = []
     monkeypatch.setattr(search, "ALWAYS_SITES", sites)
     monkeypatch.setattr(
-        search, "_search", lambda *args, failed: searched.append(failed)
+        search.Search, "add_shown", lambda _, *, failed: searched.append(failed)
     )
     options = Options(misalignment_model="linear")
     solved = solve_joint(readings, options)
@@ -135,7 +135,7 @@ def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(
     searched = []
     monkeypatch.setattr(search, "ALWAYS_SITES", 24)
     monkeypatch.setattr(
-        search, "_search", lambda *args, failed: searched.append(failed)
+        search.Search, "add_shown", lambda _, *, failed: searched.append(failed)
     )
     options = Options(terms=parse_terms(["plate_scale:1e-3"], ""))
     solved = solve_joint(readings, options)
