@@ -217,7 +217,7 @@ def of_all_runs(results: Sequence[CalibrationResult | None]) -> Provenance:
 
 
 SINGLE = 0.8
-"""Member of the scatter between runs above which a single shape is nearly all of it."""
+"""Part of the scatter between runs above which a single shape is nearly all of it."""
 TINY = np.finfo(float).tiny
 
 
@@ -418,7 +418,7 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
 
     Parameters
     ----------
-    runs : list of Run
+    runs : list of RunValues
         At least two, with the same values.
     removed : float array (d, r)
         Columns that are the datum of each run, which is removed.

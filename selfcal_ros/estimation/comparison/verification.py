@@ -75,9 +75,9 @@ class Verification:
     ----------
     better : bool
         Whether the error with the correction is less, beyond the uncertainty of both.
-    fault : Fault
+    fault : TableFault
         What is wrong with the correction that acts on x and y.
-    theta_fault : Fault
+    theta_fault : TableFault
         The same for the angle: NONE, OFF, SIGN, FACTOR or OTHER.
     remains : bool
         Whether x, y have an error with the correction beyond both uncertainties.

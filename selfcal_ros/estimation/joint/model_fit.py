@@ -142,7 +142,7 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
 
 
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
-    """Return the solution with the sizes as they are; arguments as `finer.fit_model`."""
+    """Return the solution with the sizes as they are; arguments as `fit_model`."""
     state = _State(problem)
     check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):

@@ -704,8 +704,8 @@ def _error_map(
     no images yet. The uncertainty is given if it is `with_uncertainty`.
     """
     problem, fitted = model.problem, model.fitted
-    system, length = problem.system, problem.half_width_m
-    u_x = u_y = np.full(system.grid.views.shape, np.nan)
+    system = problem.system
+    u_xy = np.full((2, *system.grid.views.shape), np.nan)
     u_theta = np.full(system.angular.n_lines, np.nan)
     closure = None
     kept_parts = Kept()
@@ -721,7 +721,7 @@ def _error_map(
                     kept_parts = Kept(
                         added=np.asarray(structured(model, cover, system.gauge.shear))
                     )
-            u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
+            u_xy = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if with_uncertainty else u_theta
@@ -745,28 +745,18 @@ def _error_map(
     known_sites = system.known_sites
     field = np.where(known_sites, fitted.field, complex(np.nan, np.nan))
     g_theta = np.where(system.known_lines, fitted.g_theta, np.nan)
-    o, r = system.gauge.first_order(fitted.field)
     sense = measurements.sense
     field = turned_over(sense, field)
-    u_x, u_y = (turned_over(sense, u, sign=1) for u in (u_x, u_y))
+    u_xy = np.stack([turned_over(sense, u, sign=1) for u in u_xy])
     g_theta = lines_turned_over(sense, g_theta)
     u_theta = lines_turned_over(sense, u_theta, sign=1)
-    return (
-        ErrorMap(
-            artifact=measurements.artifact.field,
-            gx=field.real.copy(),
-            gy=field.imag.copy(),
-            u_gx=u_x,
-            u_gy=u_y,
-            g_theta=g_theta,
-            u_g_theta=u_theta,
-            nonorthogonality=o / length,
-            scale_difference=r / length,
-            datum_theta=problem.conditions.datum,
-        ),
-        closure,
-        kept_parts,
+    emap = ErrorMap.of_maps(
+        measurements.artifact.field,
+        (np.stack([field.real, field.imag]), u_xy),
+        (g_theta, u_theta),
     )
+    datum = problem.conditions.datum
+    return replace(emap, datum_theta=datum), closure, kept_parts
 
 
 def _beside_map(

@@ -219,7 +219,7 @@ class Gauge:
         return self._gram_inverse @ products[: len(self._gram_inverse)]
 
     def dual(self, mode: int) -> np.ndarray:
-        """Return the row that gives one of `parts`, complex (nx, ny), real inner product."""
+        """Return the row that gives one of `coefficients`, complex (nx, ny), real inner product."""
         return (self._gram_inverse[mode] @ self._rows).reshape(self.known.shape)
 
     def remove(self, field: np.ndarray, modes: np.ndarray) -> np.ndarray:
@@ -256,12 +256,6 @@ class Gauge:
         flat = np.stack([*_modes(self.z, self.known), 1j * back, back])
         rows = _inverse((flat.conj() @ flat.T).real)[4:] @ flat
         return rows.reshape(2, *self.z.shape)
-
-    def first_order(self, field: np.ndarray) -> tuple[float, float]:
-        """Return O and R of `field`, times the half width."""
-        field_known = np.where(self.known, field, 0.0).conj().reshape(-1)
-        o_and_r = (self.shear.reshape(2, -1) @ field_known).real
-        return float(o_and_r[0]), float(o_and_r[1])
 
 
 def _modes(z: np.ndarray, is_known: np.ndarray) -> np.ndarray:

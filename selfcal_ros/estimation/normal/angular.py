@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from selfcal_ros.compensation.circle import fourier_basis, fourier_coefficients
 from selfcal_ros.estimation.lattice.connectivity import Components
-from selfcal_ros.estimation.normal.eliminated import PlateEliminated, over_nodes
+from selfcal_ros.estimation.normal.eliminated import PlateEliminated
 
 MAX_FULL = 31 * 31
 """Largest number of values with full matrices over them: 7 MB each."""
@@ -117,9 +117,7 @@ class AngularSystem(PlateEliminated):
         """Factor of the eliminated matrix over the lines, one of each component pinned."""
         pins = np.zeros(self.n_lines)
         pins[self.pins] = self.weight.sum() / max(self.n_readings, 1)
-        matrix = over_nodes(self.rows, self.weight, self.relative_weight)[0] + diags(
-            pins
-        )
+        matrix = self.over_nodes(self.rows)[0] + diags(pins)
         return splu(
             matrix.tocsc(),
             permc_spec="MMD_AT_PLUS_A",
@@ -252,7 +250,7 @@ class HarmonicSystem(AngularSystem):
     @cached_property
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues and vectors of the matrix over the coefficients, plate eliminated."""
-        matrix = over_nodes(tuple(self.basis), self.weight, self.relative_weight)[0]
+        matrix = self.over_nodes(tuple(self.basis))[0]
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         return values, vectors
 

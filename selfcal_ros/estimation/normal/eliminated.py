@@ -254,30 +254,22 @@ class PlateEliminated(ABC):
             sites = sites - of_sites
         return sites, -misalignments - np.real(sites.conj().T @ self.response).T
 
+    def over_nodes(
+        self, rows: Sequence[csr_matrix | np.ndarray]
+    ) -> tuple[csr_matrix, csr_matrix]:
+        """Return the matrix over the nodes with the marks eliminated, and the rows of their means.
 
-def over_nodes(
-    rows: Sequence[csr_matrix | np.ndarray],
-    weight: np.ndarray,
-    relative_weight: np.ndarray,
-) -> tuple[csr_matrix, csr_matrix]:
-    """Return the matrix over the nodes with the marks eliminated, and the rows of their means.
-
-    Parameters
-    ----------
-    rows : sequence of matrix (marks, nodes)
-        From the map to the readings of each view.
-    weight, relative_weight : float array (views, *marks)
-        Weights, and shares in the mean of a mark.
-    """
-    count = len(rows)
-    of_views = sum(
-        row.conj().T @ (diags(view_weight) @ row)
-        for row, view_weight in zip(rows, weight.reshape(count, -1), strict=True)
-    )
-    mean = sum(
-        diags(view_share) @ row
-        for row, view_share in zip(
-            rows, relative_weight.reshape(count, -1), strict=True
+        `rows`, matrices (marks, nodes), lead from the map to the readings of each view.
+        """
+        weight, share = (
+            of_readings.reshape(self.n_views, -1)
+            for of_readings in (self.weight, self.relative_weight)
         )
-    )
-    return of_views - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean
+        mean = sum(
+            diags(of_view) @ row for of_view, row in zip(share, rows, strict=True)
+        )
+        of_views = sum(
+            row.conj().T @ (diags(of_view) @ row)
+            for of_view, row in zip(weight, rows, strict=True)
+        )
+        return of_views - mean.conj().T @ (diags(weight.sum(axis=0)) @ mean), mean

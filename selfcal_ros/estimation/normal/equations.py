@@ -36,7 +36,6 @@ from selfcal_ros.estimation.normal.angular import (
     AngularSystem,
     HarmonicSystem,
 )
-from selfcal_ros.estimation.normal.eliminated import over_nodes
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
@@ -528,7 +527,7 @@ class PlacedSystem(GridSystem):
             phase.conjugate() * view_rows
             for phase, view_rows in zip(self.views.phases, self.views.rows, strict=True)
         ]
-        return over_nodes(rows, self.weight, self.relative_weight)
+        return self.over_nodes(rows)
 
     @property
     def too_large_to_refine(self) -> bool:

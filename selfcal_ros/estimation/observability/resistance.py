@@ -194,10 +194,12 @@ class PlannedTerms:
         return [term for term in self.model if term.name != name]
 
     def _unseen_modes(self, name: str) -> int:
-        other_free_terms = [term for term in self._other_terms(name) if term.free]
-        return _n_unseen(
-            with_terms(self.all_terms, [*other_free_terms, ModelTerm(name)])
-        ) - _n_unseen(with_terms(self.all_terms, other_free_terms))
+        free_terms = [term for term in self._other_terms(name) if term.free]
+        before, after = (
+            self.all_terms.unseen(rows_of(self.all_terms.columns, terms)).shape[1]
+            for terms in (free_terms, [*free_terms, ModelTerm(name)])
+        )
+        return after - before
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
@@ -218,14 +220,15 @@ class PlannedTerms:
     def _power(self, name: str, size: float, level: float) -> float:
         all_terms = self.all_terms
         other_terms = [ModelTerm(term.name) for term in self._other_terms(name)]
-        of_others = with_terms(all_terms, other_terms)
+        others = rows_of(all_terms.columns, other_terms)
+        rank_of_others = others.sum() - all_terms.undetermined(others).shape[1]
         values, rank = self._information(name, other_terms)
         grid = all_terms.system.grid
         dof = (
             2 * grid.n_readings
             - all_terms.system.rank_grid
             + all_terms.columns.within.dof
-            - of_others.rank()
+            - rank_of_others
             - rank
         )
         if rank == 0 or dof <= 0:
@@ -307,10 +310,6 @@ def check_terms(
         for name in blocks()
         if name in all_sizes
     )
-
-
-def _n_unseen(equations: TermEquations) -> int:
-    return equations.unseen(np.ones(equations.n, dtype=bool)).shape[1]
 
 
 NOISE = "reading noise"

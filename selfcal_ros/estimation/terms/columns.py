@@ -212,7 +212,7 @@ def within_marks(
     for view, view_visits in enumerate(visits):
         if view_visits is None or not view_visits.repeated:
             continue
-        dof += 2 * (len(view_visits.mark) - len(np.unique(view_visits.mark)))
+        dof += 2 * view_visits.n_repeats
         shapes_of_view = [
             number for number, values in enumerate(at_visits) if view in values
         ]

@@ -524,10 +524,6 @@ class TermEquations:
         ) / np.outer(norm, norm)
         return out
 
-    def rank(self) -> int:
-        """Return the number of combinations of all coefficients determined by the readings."""
-        return self.n - self.undetermined(np.ones(self.n, dtype=bool)).shape[1]
-
 
 def equations_of_columns(
     system: NormalEquations,

@@ -118,7 +118,8 @@ class StagePlaces:
     ) -> list[np.ndarray | float]:
         """Return the excess of the visits of each view over the mean of their mark, (V,), m.
 
-        By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
+        By the slopes of the stage error where the stage stood; arguments as in `differences` and
+        `changes`.
         """
         cells = self._cells(_filled(field, self.known))
         s, t = self._place(near)

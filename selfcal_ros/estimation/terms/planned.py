@@ -245,7 +245,7 @@ def with_terms(equations: TermEquations, terms: Iterable[ModelTerm]) -> TermEqua
 
     Parameters
     ----------
-    every : TermEquations
+    equations : TermEquations
         Sized terms: columns of the plate exist for all views.
     terms : iterable of ModelTerm
         Free ones have no columns of the plate in the first view, as in `term_columns`.

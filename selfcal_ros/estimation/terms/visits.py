@@ -85,6 +85,11 @@ class ViewVisits:
         """Whether a mark was visited more than once; if not, its visit is its mean."""
         return bool(len(self.mark)) and int(np.bincount(self.mark).max()) > 1
 
+    @property
+    def n_repeats(self) -> int:
+        """Number of visits beyond the first of each mark."""
+        return len(self.mark) - len(np.unique(self.mark))
+
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return complex values (k, V) minus the mean of their mark."""
         if not self.repeated:

@@ -270,7 +270,7 @@ def _missed(
         The positions of the stage.
     field : complex array (nx, ny)
         Stage error at the sites, m.
-    there : complex array (P,)
+    error_there : complex array (P,)
         Stage error of the solution at the positions of the stage.
     """
     smooth = places.differences(field, error_there)
@@ -858,7 +858,7 @@ def scatter_of_views(
         dof = float(view.dof_xy)
         if index in revisited:
             visits, residuals = revisited[index]
-            dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
+            dof = 2.0 * visits.n_repeats
             sigma = float(np.sqrt(visits.weight @ abs(residuals) ** 2 / dof))
         if len(view.m) and dof > 0 and np.isfinite(sigma):
             scatter.append((view.view.name, sigma, dof))

@@ -159,7 +159,7 @@ def _contrasts(model: ModelFit) -> _Contrasts:
                 strict=True,
             ):
                 total += np.bincount(site, weight * values, total.size)
-        dof += len(visits.mark) - len(np.unique(visits.mark))
+        dof += visits.n_repeats
     product, information, signs_of_sites, weights = sums
     return _Contrasts(
         product=product,

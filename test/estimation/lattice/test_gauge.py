@@ -16,13 +16,18 @@ def place():
     return x, y, known
 
 
+def o_and_r(gauge, field):
+    """Return O and R of a field, times the half width."""
+    return tuple(np.vdot(rows, field).real for rows in gauge.shear)
+
+
 def test_nonorthogonality_and_scale_difference_are_those_of_the_known_sites():
     """Gx = O y + R x, Gy = O x - R y beside a shift, a turn and a scale; nonsense elsewhere."""
     x, y, known = place()
     field = (3e-7 * y - 2e-7 * x) + 1j * (3e-7 * x + 2e-7 * y)
     field += 5e-6 - 4e-6j + (7e-6 + 8e-6j) * (x + 1j * y)
     field[~known] = 1.0
-    o, r = Gauge(x + 1j * y, known, scale=True).first_order(field)
+    o, r = o_and_r(Gauge(x + 1j * y, known, scale=True), field)
     assert (o, r) == (pytest.approx(3e-7, rel=1e-8), pytest.approx(-2e-7, rel=1e-8))
 
 
@@ -36,4 +41,4 @@ def test_first_order_parts_of_any_field_are_those_of_a_dense_least_squares():
         0
     ]
     gauge = Gauge(x + 1j * y, known, scale=True)
-    assert gauge.first_order(gx + 1j * gy) == pytest.approx(tuple(want[4:]), abs=1e-20)
+    assert o_and_r(gauge, gx + 1j * gy) == pytest.approx(tuple(want[4:]), abs=1e-20)
