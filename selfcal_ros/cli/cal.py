@@ -575,7 +575,7 @@ def figures_of(residuals: "list[Residual]") -> dict:
 def residual_text(residuals: "list[Residual]") -> str:
     """Return the residuals as a small table: µm, and arcsec for angular lines."""
     lines = [
-        "residual true - commanded, without its constant shift         before          after"
+        f"{'true - commanded, without its constant shift':<48}{'before':>16}{'after':>15}"
     ]
     names = {
         "sites": "sites",

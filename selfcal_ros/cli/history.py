@@ -92,15 +92,14 @@ def _text(
 ) -> Iterator[str]:
     used, since = active
     yield (
-        f"  {'measured':<18}{'what':<13}{'largest error':>15}{'U rms':>12}  change from the one "
-        "before: largest, rms"
+        f"  {'measured':<18}{'what':<12}{'largest error':>14}{'U rms':>11}  change: largest, rms"
     )
     for entry in entries:
         mark = "*" if entry is used else " "
         grade = "" if entry.result.verdict.qualified else ", not qualified"
         yield (
-            f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<13}"
-            f"{um(_largest_m(entry)):>15}{um(entry.expanded_m):>12}  "
+            f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<12}"
+            f"{um(_largest_m(entry)):>14}{um(entry.expanded_m):>11}  "
             f"{_change_text(entry.change)}  {entry.path.relative_to(folder)}{grade}"
         )
     if used is None:

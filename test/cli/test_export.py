@@ -45,7 +45,8 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     assert run(line) == 0
     out = capsys.readouterr().out.splitlines()
     assert out[: len(files)] == files and all(Path(file).is_file() for file in files)
-    assert out[len(files)].startswith("residual true - commanded")
+    assert out[len(files)].startswith("true - commanded")
+    assert len(out[len(files)]) < 80
     assert out[len(files) + 7] == "to put it into use:" and all(
         line.startswith(f"  {number}. ")
         for number, line in enumerate(out[len(files) + 8 :], 1)

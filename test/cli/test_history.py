@@ -89,7 +89,9 @@ def test_the_next_is_due_when_the_drift_reaches_u(folder, capsys):
     for day in (4, 8, 12):
         write(folder / f"{day}.json", day=day, bow_m=day * 2e-8)
     assert main(["history", str(folder), "--activate", "a.json"]) == 0
-    assert "* 2026-03-01 08:00  calibration" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "* 2026-03-01 08:00  calibration" in text
+    assert len(text.splitlines()[0]) <= 80
     found = told(folder, capsys)
     drift = found["drift"]
     result = read_result(folder / "a.json")

@@ -98,6 +98,8 @@ def test_a_correction_that_acts(folder, capsys):
     text = capsys.readouterr().out
     assert text.startswith("Better: the error is ")
     assert "the correction acts as the map says" in text
+    table = text.split("\n\n")[1].splitlines()
+    assert len(table) == 8 and max(map(len, table)) <= 80
     assert "θ, arcsec" in text
 
 

@@ -120,7 +120,7 @@ def terms_section(result: CalibrationResult) -> Section:
             how = (
                 "free"
                 if term.size is None
-                else f"size {size_of(term.name, item.unit, term.size)}"
+                else size_of(term.name, item.unit, term.size)
             )
             if term.size_used is not None:
                 used = size_of(term.name, item.unit, term.size_used)
@@ -131,17 +131,18 @@ def terms_section(result: CalibrationResult) -> Section:
             decimals = decimals_for([u], 2)
             rows.append(
                 (
-                    f"{term.name} ({how})",
+                    term.name,
                     item.view or "all",
                     item.component,
                     fixed(value, decimals),
                     fixed(u, decimals),
                     unit,
+                    how,
                 )
             )
     if not rows:
         return Section("Terms of the model")
-    header = ("term", "view", "component", "value", "u (k=1)", "unit")
+    header = ("term", "view", "component", "value", "u (k=1)", "unit", "size")
     return Section("Terms of the model", table=(header, *rows))
 
 

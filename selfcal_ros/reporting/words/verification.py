@@ -167,7 +167,7 @@ def verification_text(verification: Verification) -> str:
         [
             verification_sentence(verification),
             "",
-            *aligned(rows),
+            *aligned(list(zip(*rows, strict=True))),
             "",
             "  U: expanded uncertainty of a node, rms; acts: part of the correction that "
             "acts (1 is right), ± u",

@@ -355,23 +355,22 @@ def test_terms_of_the_model_are_shown_with_their_uncertainties():
     text = summary_text(replace(result, model=ModelResult("rigid", terms)))
     assert line_with(text, "microscope").split() == [
         "microscope",
-        "(free)",
         "all",
         "xy",
         "-2000",
         "30",
         "µm/m",
+        "free",
     ]
     assert line_with(text, "drift").split() == [
         "drift",
-        "(size",
-        "0.05",
-        "µm)",
         "rot90",
         "x",
         "P1",
         "0.0400",
         "0.0010",
+        "µm",
+        "0.05",
         "µm",
     ]
 
