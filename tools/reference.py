@@ -154,7 +154,9 @@ SOMETIMES = {
     "degree, coefficients, cells, noise_image, noise_mark (m), and yaw of the stage {x, y (m), "
     "yaw, u_yaw (rad), p}",
     "images": "of images with several marks: share of the variance of a reading that they have in "
-    "common, dof_mark (null = many), and of each grid view placing and step (m, n) of its cell",
+    "common, dof_mark (null = many), and of each grid view placing and step (m, n) of its cell; "
+    "motion {mark, white, slow} (null if none is slow): variances, over that of a reading, of a "
+    "mark by itself and of white and slow motion that the marks of an image share",
     "first_order_added": "what unequal or correlated noise adds to the variances of O and of R, "
     "times the square of the half width, for unit noise",
     "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -150,6 +150,23 @@ class Factors:
 
 
 @dataclass(frozen=True)
+class SlowKept:
+    """Noises of images that move slowly, as variances over that of a reading.
+
+    Attributes
+    ----------
+    mark : float
+        Of a mark by itself.
+    white, slow : float
+        Of the motion that the marks of an image share: white, and with a power of 1/f.
+    """
+
+    mark: float
+    white: float
+    slow: float
+
+
+@dataclass(frozen=True)
 class ImagesKept:
     """Noise of images with several marks.
 
@@ -163,12 +180,15 @@ class ImagesKept:
         Number of the placing of the plate in each grid view.
     step : tuple of (int, int)
         Step (m, n) of the cell of each grid view on the plate.
+    motion : SlowKept, optional
+        In place of `share` where the images move slowly.
     """
 
     share: float
     dof_mark: float
     placing: tuple[int, ...]
     step: tuple[tuple[int, int], ...]
+    motion: SlowKept | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +268,7 @@ def kept_from_dict(
         0 <= images.share <= 1
         and images.dof_mark >= 0
         and all(len(step) == 2 for step in images.step)
+        and (images.motion is None or all(v >= 0 for v in astuple(images.motion)))
     ):
         raise ValueError(f"{IMAGES}: no noise of images")
     return Kept(

@@ -6,7 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from selfcal_ros.model.kept import Covariance, Factors, ImagesKept, Kept, kept_from_dict
+from selfcal_ros.model.kept import (
+    Covariance,
+    Factors,
+    ImagesKept,
+    Kept,
+    SlowKept,
+    kept_from_dict,
+)
 
 MAP, PLATE, LINES = (3, 2), (4, 5), 6
 RNG = np.random.default_rng(1)
@@ -25,7 +32,13 @@ FULL = Kept(
     ),
     {"drift": RNG.random(LINES)},
     RNG.random(2),
-    ImagesKept(0.25, 80.0, (0, 0, 1), ((0, 0), (1, -1), (0, 0))),
+    ImagesKept(
+        0.25,
+        80.0,
+        (0, 0, 1),
+        ((0, 0), (1, -1), (0, 0)),
+        SlowKept(0.75, 0.0, 0.4),
+    ),
     {"xy": Covariance.of(np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18)},
 )
 
@@ -38,6 +51,8 @@ def test_json_keeps_all_of_it_to_the_last_bit():
     assert found.factors.with_map == 1
     assert found.factors.beside_terms == ("line_scale", "line_scale")
     del data["covariance_terms"]["beside"]["terms"]  # as older files
+    del data["images"]["motion"]
+    assert kept_from_dict(data, MAP, PLATE, LINES).images.motion is None
     assert kept_from_dict(data, MAP, PLATE, LINES).factors.beside_terms == ()
     np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
     np.testing.assert_array_equal(
@@ -151,6 +166,8 @@ def test_what_is_infinite_or_unknown_is_kept():
         (("images", "share"), None, "images: no noise of images"),
         (("images", "dof_mark"), -1.0, "images: no noise of images"),
         (("images", "step"), [[0], [1], [0]], "images: no noise of images"),
+        (("images", "motion", "slow"), -0.1, "images: no noise of images"),
+        (("images", "motion", "slow"), None, "images: no noise of images"),
     ],
 )
 def test_what_is_damaged_is_refused(where, value, message):

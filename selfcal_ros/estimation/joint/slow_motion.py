@@ -14,13 +14,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
+from scipy.linalg import toeplitz
 from scipy.special import stdtr
 
 from selfcal_ros.estimation.checks.wiring import F_LEVEL
 from selfcal_ros.estimation.joint.images import fitted_alone
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.normal.angular import FLOOR
-from selfcal_ros.estimation.normal.equations import N_DRAWS, NormalEquations
+from selfcal_ros.estimation.normal.equations import N_DRAWS, TRACE, NormalEquations
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
 
 LEAST = 4
@@ -161,7 +162,8 @@ def slow_motion(model: ModelFit) -> SlowMotion | None:
     sigma = model.fitted.xy.sigma
     if images is None or not sigma > FLOOR:
         return None
-    exposures = _exposures(model.problem.inputs)
+    inputs = model.problem.inputs
+    exposures = _exposures(inputs, LEAST * (inputs.drift_degree + 1))
     about = {row: values for row, _, values in model.visits_about_means()}
     residuals = model.fitted.residuals
     of_marks = residuals.reshape(len(residuals), -1)
@@ -188,6 +190,51 @@ def slow_motion(model: ModelFit) -> SlowMotion | None:
     return SlowMotion(exposures, slow / sigma**2, (white - noises.image**2) / sigma**2)
 
 
+@dataclass(frozen=True, eq=False)
+class MotionOfStops:
+    """What motion makes of the means of the stops of a stage.
+
+    Attributes
+    ----------
+    covariance : float array (stops, stops)
+        Of the means, over what white motion of the same size makes of each.
+    shown, dof : float
+        Variance of the exposures of one stop about its mean, and its degrees of freedom, over those
+        of white motion: 1 both if nothing is slow.
+    """
+
+    covariance: np.ndarray
+    shown: float
+    dof: float
+
+    @classmethod
+    def of(cls, inputs: TermInputs, stop: np.ndarray, slow: float) -> "MotionOfStops":
+        """Return it for the stop of each mark, int (views, nx, ny), -1 if it was not read.
+
+        `slow` is the part of the motion that is slow, in the order of the visits.
+        """
+        n_stops = int(stop.max()) + 1
+        of_marks = stop.reshape(len(stop), -1)
+        covariance = np.eye(n_stops)
+        white = within = squares = 0.0
+        for one in _exposures(inputs, 1) if slow else ():
+            weight = np.zeros((n_stops, one.number))
+            np.add.at(weight, (of_marks[one.row, one.mark], one.exposure), one.root**2)
+            used = np.flatnonzero(weight.any(axis=1))
+            gain = np.sqrt(weight[used] / weight[used].sum(axis=1, keepdims=True))
+            correlation = toeplitz(slow_correlation(one.number))
+            motion = slow * correlation + (1 - slow) * np.eye(one.number)
+            covariance[np.ix_(used, used)] = gain @ motion @ gain.T
+            about = np.diag(weight.any(axis=0).astype(float)) - gain.T @ gain
+            left = about @ motion @ about
+            white += about.trace()
+            within += left.trace()
+            squares += (left**2).sum()
+        if not within > TRACE * len(covariance):  # no repeats
+            return cls(covariance, 1.0, 1.0)
+        return cls(covariance, within / white, within**2 / (white * squares))
+
+
 def _products(common: Iterable[np.ndarray]) -> np.ndarray:
     """Return the sum of squares of what exposures have in common, and that by its neighbour's."""
     products = np.zeros(2)
@@ -199,10 +246,9 @@ def _products(common: Iterable[np.ndarray]) -> np.ndarray:
     return products
 
 
-def _exposures(inputs: TermInputs) -> tuple[Exposures, ...]:
-    """Return the exposures of each placing that has enough of them."""
+def _exposures(inputs: TermInputs, least: int) -> tuple[Exposures, ...]:
+    """Return the exposures of each placing that has more than `least` of them."""
     out = []
-    least = LEAST * (inputs.drift_degree + 1)
     for members in inputs.members.values():
         seen = [
             (row, visits)

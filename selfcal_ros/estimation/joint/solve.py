@@ -35,6 +35,7 @@ from selfcal_ros.estimation.joint.problem import (
     noise_gain,
     problem_of,
 )
+from selfcal_ros.estimation.joint.slow_motion import slow_motion
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import MAX_FULL
@@ -62,7 +63,7 @@ from selfcal_ros.model.findings import (
     ReferenceOff,
     Unchecked,
 )
-from selfcal_ros.model.kept import Factors, ImagesKept, Kept, rounded
+from selfcal_ros.model.kept import Factors, ImagesKept, Kept, SlowKept, rounded
 from selfcal_ros.model.parts import Parts, ResidualsOfViews, ViewCourse, ViewResiduals
 from selfcal_ros.model.readings import (
     GridVisits,
@@ -581,12 +582,21 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | No
     if model.problem.images is None or cells_of_views is None:
         return None
     noises = model.problem.images.noises(model.fitted.residuals)
+    motion = slow_motion(model)
+    of_reading = model.fitted.xy.sigma**2
     names = list(dict.fromkeys(name for name, _ in cells_of_views))
     return ImagesKept(
         noises.share,
         noises.dof_mark,
         tuple(names.index(name) for name, _ in cells_of_views),
         tuple(step for _, step in cells_of_views),
+        None
+        if motion is None
+        else SlowKept(
+            noises.mark**2 / of_reading,
+            motion.white + noises.image**2 / of_reading,
+            motion.slow,
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import fdtrc
 
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
@@ -29,6 +30,7 @@ from selfcal_ros.estimation.joint.problem import (
     noise_estimate,
     problem_of,
 )
+from selfcal_ros.estimation.joint.slow_motion import MotionOfStops
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
 from selfcal_ros.estimation.lattice.readings import (
     Marks,
@@ -88,6 +90,7 @@ from selfcal_ros.model.findings import (
     PlateMisfit,
     ScaleChanged,
 )
+from selfcal_ros.model.kept import SlowKept
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
@@ -196,13 +199,15 @@ def recheck_of(
             _problem(measurements, options, plate),
             repeats_xy=(min(sigma, microscope.sigma), dof),
         )
-    xy, theta = _noise(measurements, problem, plate)
+    images = _images(measurements, problem, plate)
+    xy, theta = _noise(images, problem, plate)
     readings = _readings(
         measurements,
         problem,
         options,
         plate=plate,
         sigma=xy.sigma,
+        images=images,
         microscope=microscope,
     )
     solution = solve_marks(readings)
@@ -455,6 +460,60 @@ def _problem(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class StopsOfImages:
+    """Stops at which images were taken, with their noise as the calibration knows it.
+
+    Attributes
+    ----------
+    stop : int array (views, nx, ny)
+        At which each mark was read; -1 = not read.
+    share : float
+        Part of the variance of a reading that the marks of an image have in common.
+    mark, motion : float
+        Variances of the noise of a mark, and of what the marks of an image share, m^2.
+    of_stops : MotionOfStops
+        What that makes of the means of the stops.
+    """
+
+    stop: np.ndarray
+    share: float
+    mark: float
+    motion: float
+    of_stops: MotionOfStops
+
+    def repeats(self, sigma: float, dof: float) -> tuple[float, float]:
+        """Return the noise of a reading, m, and its dof, given those of repeats of marks."""
+        hidden = max(sigma**2 - self.mark, 0.0) * (1 / self.of_stops.shown - 1)
+        shared = 1 + (marks_of_image(self.stop[self.stop >= 0]) - 1) * self.share
+        return float(np.sqrt(sigma**2 + hidden)), dof * self.of_stops.dof / shared
+
+
+def _images(
+    measurements: Measurements, problem: Problem, plate: KnownPlate
+) -> StopsOfImages | None:
+    """Return the stops at which images were taken; None without images.
+
+    What of their motion is slow is the calibration's: in a single pass it looks like a change of
+    the stage.
+    """
+    if not measurements.has_images:
+        return None
+    kept, of_reading = plate.result.kept.images, plate.result.noise.sigma_xy**2
+    share = share_of(plate.result)
+    motion = (kept and kept.motion) or SlowKept(1 - share, share, 0.0)
+    total = motion.white + motion.slow
+    stop = _stops(measurements, problem)
+    slow = motion.slow / total if total else 0.0
+    return StopsOfImages(
+        stop,
+        share,
+        motion.mark * of_reading,
+        total * of_reading,
+        MotionOfStops.of(problem.inputs, stop, slow),
+    )
+
+
 def _readings(
     measurements: Measurements,
     problem: Problem,
@@ -462,6 +521,7 @@ def _readings(
     *,
     plate: KnownPlate,
     sigma: float,
+    images: StopsOfImages | None,
     microscope: "SeenMicroscope | None",
 ) -> PlateReadings:
     """Return the readings with what has an effect on them, for the noise of one reading, m.
@@ -472,9 +532,8 @@ def _readings(
     _require_noise(sigma)
     variance = sigma**2
     stop = _stops(measurements, problem)
-    if measurements.has_images:
-        variance = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
-        variance = float(np.clip(variance, TRACE * sigma**2, sigma**2))
+    if images is not None:
+        variance = float(np.clip(images.mark, TRACE * sigma**2, sigma**2))
     read = problem.system.grid.read
     sites = plate.together.sites
     marks = read.any(axis=0)
@@ -515,6 +574,8 @@ def _readings(
         before=before,
         length=plate.length_at(marks)[of_plate_and_offsets[start:] - start],
     )
+    if images is not None:
+        effects = effects.with_noise(images.of_stops.covariance)
     if microscope is not None:
         effects = effects.known_as(of_microscope, microscope.covariance)
     return PlateReadings(
@@ -680,34 +741,34 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
 
 
 def _noise(
-    measurements: Measurements, problem: Problem, plate: KnownPlate
+    images: StopsOfImages | None, problem: Problem, plate: KnownPlate
 ) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Return the noise of the readings: of many repeats, else that of the calibration.
 
-    It is what detections declare if that is larger: no residual tests whether they declare too
-    little. What detections of images declare is the noise of a mark, without that of its image.
+    Few repeats count if they show more. It is what detections declare if that is larger: no
+    residual tests whether they declare too little. What detections of images declare is the noise
+    of a mark, without that of its image.
     """
     before = plate.result.noise
     nan = float("nan")
     of_marks = problem.repeats_xy
     of_mark = problem.grid.sigma_declared
     out = []
-    if measurements.has_images:
-        stop = _stops(measurements, problem)
-        fewer = 1 + (marks_of_image(stop[stop >= 0]) - 1) * share_of(plate.result)
-        of_marks = (of_marks[0], of_marks[1] / fewer)
-        of_mark = nan
+    if images is not None:
+        before = replace(before, sigma_xy=float(np.sqrt(images.mark + images.motion)))
+        of_marks, of_mark = images.repeats(*of_marks), nan
     for kind, repeats, declared in (
         ("xy", of_marks, of_mark),
         ("theta", problem.repeats_theta, problem.angular.sigma_declared),
     ):
         noise = noise_estimate(repeats, (nan, 0), nan)
-        if not (noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF):
-            noise = replace(
-                noise,
-                sigma=getattr(before, f"sigma_{kind}"),
-                dof=getattr(before, f"dof_{kind}"),
-            )
+        sigma, dof = getattr(before, f"sigma_{kind}"), getattr(before, f"dof_{kind}")
+        many = noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF
+        more = noise.sigma > sigma > FLOOR and (
+            fdtrc(noise.dof, dof, (noise.sigma / sigma) ** 2) < USUAL_LEVEL
+        )
+        if not (many or more):
+            noise = replace(noise, sigma=sigma, dof=dof)
         larger = max(noise.sigma, np.nan_to_num(declared))
         out.append(replace(noise, sigma=larger, declared=declared))
     return out[0], out[1]

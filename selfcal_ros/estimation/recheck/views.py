@@ -80,6 +80,13 @@ class Effects:
         all_known[np.ix_(rows, rows)] = covariance
         return replace(self, mean=mean, covariance=all_known)
 
+    def with_noise(self, covariance: np.ndarray) -> "Effects":
+        """Return the effects with a covariance, (n, n), of those of noise along each axis."""
+        of_noise = self.source == NOISE
+        everything = self.covariance.copy()
+        everything[np.ix_(of_noise, of_noise)] = np.kron(np.eye(2), covariance)
+        return replace(self, covariance=everything)
+
     def projected(
         self,
         columns: tuple[np.ndarray, ...],

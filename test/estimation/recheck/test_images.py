@@ -5,17 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, toeplitz
 from scipy.stats import binom
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import together
+from selfcal_ros.estimation.joint.slow_motion import slow_correlation
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
 from selfcal_ros.model.error_map import datum_modes, remove_modes
+from selfcal_ros.model.kept import SlowKept
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings
 from test.estimation.joint.test_images import DISTORTED, MARK, datum, dense
@@ -71,10 +73,27 @@ def values(measurements) -> np.ndarray:
     )
 
 
+def slow_covariance(measurements, slow) -> np.ndarray:
+    """Return the covariance of the means of marks, along an axis, by partly slow motion, 1."""
+    times = np.unique(
+        np.concatenate([view.visits.stamp_ns for view in measurements.views])
+    )
+    means = []
+    for view in measurements.views:
+        visits, mean = view.visits, np.zeros((len(view.m), len(times)))
+        share = 1 / np.bincount(visits.mark)[visits.mark]
+        mean[visits.mark, np.searchsorted(times, visits.stamp_ns)] = share
+        means.append(mean)
+    mean, white = np.vstack(means), np.eye(len(times))
+    motion = slow * toeplitz(slow_correlation(len(times))) + (1 - slow) * white
+    return mean @ motion @ mean.T
+
+
 @pytest.mark.parametrize(
-    ("image", "missing", "repeats"), [(3.0, 0.0, 1), (1.0, 0.06, 2)]
+    ("image", "missing", "repeats", "slow"),
+    [(3.0, 0.0, 1, 0.0), (1.0, 0.06, 2, 0.0), (3.0, 0.0, 2, 0.8)],
 )
-def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
+def test_map_and_change_as_dense_linear_algebra(image, missing, repeats, slow):
     """The plate of the calibration with its noise, then generalised least squares, both dense."""
     _, before, after = sessions(
         image * MARK,
@@ -86,9 +105,13 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
         phi_rad=0.0,
     )
     first = solve_joint(before, LINEAR).result
-    found = recheck(after, LINEAR, known_plate(first, "r.json"))
     share, power, sites = first.kept.images.share, first.noise.sigma_xy**2, 25
     assert share > 0.3
+    if slow:
+        motion = SlowKept(1 - share, (1 - slow) * share, slow * share)
+        images = replace(first.kept.images, motion=motion)
+        first = replace(first, kept=replace(first.kept, images=images))
+    found = recheck(after, LINEAR, known_plate(first, "r.json"))
     later = found.noise.sigma_xy**2
 
     (early, stops), (late, again) = dense(before), dense(after)
@@ -101,6 +124,9 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
         again[:, None] == again, np.eye(2)
     )
     two /= np.sqrt(np.outer(weight, weight))
+    if slow:
+        moved = (later - mark) * slow_covariance(after, slow)
+        two = np.diag(mark / weight) + np.kron(moved, np.eye(2))
     noise = block_diag(power * one, two)
     # G and A of the calibration: the scale is the plate's
     inverse, project = np.linalg.pinv(early, rcond=1e-10), datum(before.artifact)
@@ -248,3 +274,50 @@ def test_a_plate_calibrated_with_one_mark_an_image_does_not_tell_its_noise():
         InputError, match="not separated into that of images and that of marks"
     ):
         calibrate(after, Options(plate=alone, plate_from="r.json"))
+
+
+def slow_session(seed, repeats, *, change_m=0.0, times=1):
+    """Return a calibration and a recheck with slow motion, `times` as large in the latter."""
+    plan, rng = (
+        image_plan(7, turns=(0, 90, 180), repeats=2),
+        np.random.default_rng(seed),
+    )
+    again = image_plan(7, turns=(0,), repeats=repeats)
+    spread = Spread(phi_rad=5e-4, correlation_pitches=4.0)
+    truth = random_truth(plan.artifact, 3, rng, spread)
+    settings = CellSettings(sigma_xy_m=MARK, flicker_xy_m=2 * MARK, servo_sigma_m=0.0)
+    bent = (truth.artifact.m**2 / truth.artifact.m.max() ** 2, 0 * truth.artifact.m)
+    later = replace(
+        truth,
+        t_m=truth.t_m[2:],
+        phi_rad=truth.phi_rad[2:],
+        plate_shape_m=truth.plate_shape_m[2:],
+        g=truth.g + change_m * np.stack(bent),
+    )
+    before = simulate_measurements(truth, plan, rng, settings=settings)
+    settings = replace(settings, flicker_xy_m=times * settings.flicker_xy_m)
+    after = simulate_measurements(later, again, rng, settings=settings)
+    first = calibrate(before, Options(causes=False))
+    return first, calibrate(after, Options(plate=first, plate_from="r.json"))
+
+
+@pytest.mark.parametrize(("repeats", "seeds"), [(1, (4, 7, 19)), (2, (10, 17, 27))])
+def test_slow_motion_is_no_change_of_the_stage(repeats, seeds):
+    """Seeds of which all were said to have changed, p down to 1e-5, with motion taken as white."""
+    for seed in seeds:
+        first, result = slow_session(seed, repeats)
+        motion = first.kept.images.motion
+        assert motion.slow > 3 * motion.white
+        assert not result.recheck.changed
+        sigma = np.hypot(MARK, 2 * MARK)
+        assert result.noise.sigma_xy == pytest.approx(sigma, rel=0.3)
+
+
+def test_a_change_is_found_beside_slow_motion():
+    assert slow_session(0, 1, change_m=2e-7)[1].recheck.changed
+
+
+def test_few_repeats_that_show_more_slow_motion_than_the_calibration_count():
+    first, result = slow_session(0, 2, times=2)
+    assert result.noise.sigma_xy > 1.5 * first.noise.sigma_xy
+    assert result.noise.dof_xy < 30 and not result.recheck.changed
