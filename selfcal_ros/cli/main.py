@@ -316,10 +316,8 @@ class Parser(argparse.ArgumentParser):
             message = f"{names} {'are' if ', ' in names else 'is'} missing" + (
                 f": one of {', '.join(verbs)}" if verbs else ""
             )
-        self.exit(
-            int(ExitCode.BAD_INPUT),
-            printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n",
-        )
+        line = printable(f"{self.prog}: {message}; see {self.prog} --help")
+        self.exit(int(ExitCode.BAD_INPUT), fitted(line, sys.stderr) + "\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value that is not among the choices, with similar ones."""
