@@ -45,7 +45,7 @@ def map_covariance(measurements: Measurements, options: Options) -> MapCovarianc
         problem.system,
         found.inverse,
         options.reference,
-        terms=model.spread,
+        terms=model.equations,
         half_width_m=problem.half_width_m,
         sigma_m=found.xy.sigma,
     )

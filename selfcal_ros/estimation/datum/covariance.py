@@ -30,6 +30,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import BLOCK, NormalEquations, in_datum
+from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
@@ -104,51 +105,6 @@ def _slope(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
     return (unit * centred / (centred**2).sum()).ravel()
 
 
-@dataclass(frozen=True, eq=False)
-class TermSpread:
-    """What the coefficients of the terms do to an estimate, for its covariance.
-
-    Attributes
-    ----------
-    columns : complex array (p, views, nx, ny)
-        Readings of the marks for a unit of each coefficient, plate frame.
-    lines : float array (p, views, K)
-        The same of the lines.
-    fields : complex array (sites, p)
-        Map for a unit of each coefficient, in no particular datum.
-    plates : complex array (marks, p)
-        The corresponding map of the plate.
-    parameters : float array (size, p)
-        The corresponding misalignments.
-    turned : float array (K, p)
-        Angular map for a unit of each coefficient, sign reversed, rad.
-    covariance : float array (p, p)
-        Of the coefficients, for unit noise of one grid reading.
-    """
-
-    columns: np.ndarray
-    lines: np.ndarray
-    fields: np.ndarray
-    plates: np.ndarray
-    parameters: np.ndarray
-    turned: np.ndarray
-    covariance: np.ndarray
-
-    @classmethod
-    def none(cls, system: NormalEquations) -> "TermSpread":
-        """Return that of no term."""
-        grid, angular = system.grid, system.angular
-        return cls(
-            np.zeros((0, *grid.weight.shape), dtype=complex),
-            np.zeros((0, *angular.weight.shape)),
-            np.zeros((grid.n_sites, 0), dtype=complex),
-            np.zeros((grid.n_marks, 0), dtype=complex),
-            np.zeros((system.size, 0)),
-            np.zeros((angular.n_lines, 0)),
-            np.zeros((0, 0)),
-        )
-
-
 class MapsCovariance:
     """Covariance of G and A in their datum, for unit noise of one grid reading.
 
@@ -163,9 +119,19 @@ class MapsCovariance:
     half_width_m : float
         Unit of the positions, m.
     sigma_m : float
-        Noise of one grid reading, by which the reference's uncertainty is measured.
-    terms : TermSpread, optional
-        Terms of the model that were estimated with the maps.
+        Noise of one grid reading, by which the reference's uncertainty and the sizes of terms are
+        measured.
+    terms : TermEquations, optional
+        Equations of the terms that were estimated with the maps.
+
+    Attributes
+    ----------
+    fields : complex array (sites, p)
+        Map for a unit of each coefficient of the terms, in no particular datum.
+    plates : complex array (marks, p)
+        The corresponding map of the plate.
+    covariance_of_terms : float array (p, p)
+        Of the coefficients.
     """
 
     def __init__(
@@ -176,12 +142,17 @@ class MapsCovariance:
         *,
         half_width_m: float = 1.0,
         sigma_m: float = 1.0,
-        terms: TermSpread | None = None,
+        terms: TermEquations | None = None,
     ) -> None:
         self.system, self.inverse, self.length = system, inverse, half_width_m
-        self.terms = terms or TermSpread.none(system)
-        n = 3 * system.grid.n_views
-        self._p, self._moved = inverse[:n, :n], self.terms.parameters[:n]
+        self.terms, n = terms, 3 * system.grid.n_views
+        self._p = inverse[:n, :n]
+        self.fields = np.zeros((system.grid.n_sites, 0))
+        self.plates = np.zeros((system.grid.n_marks, 0))
+        self.covariance_of_terms = np.zeros((0, 0))
+        if terms is not None:
+            self.fields, self.plates = terms.projected.fields, terms.plates
+            self.covariance_of_terms = terms.inverse(sigma_m)
         self._scale = None if reference is None else scale_rows(system, reference)
         self._u = (
             0.0
@@ -207,7 +178,7 @@ class MapsCovariance:
         cov, factors, of_terms = self.independent(g, a)
         cov += (
             factors.T @ self._p @ factors
-            + of_terms.T @ self.terms.covariance @ of_terms
+            + of_terms.T @ self.covariance_of_terms @ of_terms
         )
         return (cov + cov.T) / 2
 
@@ -232,14 +203,15 @@ class MapsCovariance:
         Complex (k, views, nx, ny).
         """
         grid = self.system.grid
-        terms = self.terms
         g, a, _ = self.functionals(sites, marks)
-        field, parameters, of_coefficients = self._solved(g, a)
-        maps = (field - terms.fields @ of_coefficients).T.reshape(-1, *grid.views.shape)
-        y = np.tensordot(of_coefficients.T, terms.columns, axes=1)
-        residuals = grid.plate(
-            -y, maps, (parameters - self._moved @ of_coefficients).T
-        )[1]
+        field, parameters, of_terms = self._solved(g, a)
+        y = np.zeros((1, *grid.weight.shape))
+        if self.terms is not None:
+            y = np.tensordot(of_terms.T, self.terms.columns.grid, axes=1)
+            moved = self.terms.projected.parameters[: len(self._p)]
+            parameters = parameters - moved @ of_terms
+        maps = (field - self.fields @ of_terms).T.reshape(-1, *grid.views.shape)
+        residuals = grid.plate(-y, maps, parameters.T)[1]
         of_mark = (grid.noise_of_means[:, None] * a).T.reshape(
             -1, 1, *grid.views.plate_shape
         )
@@ -265,8 +237,8 @@ class MapsCovariance:
         """Return the maps for a unit of each coefficient in the datum, (sites, p), (marks, p)."""
         out = []
         for fields_of_terms, plate, is_known in (
-            (self.terms.fields, False, self.system.known_sites),
-            (self.terms.plates, True, self.system.known_marks),
+            (self.fields, False, self.system.known_sites),
+            (self.plates, True, self.system.known_marks),
         ):
             fields, g, a = self._datum(plate=plate)
             of_coefficients = fields_of_terms + fields @ self.of_terms(g, a).T
@@ -275,9 +247,7 @@ class MapsCovariance:
 
     def of_terms(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return functionals (sites, k), (marks, k) of free maps of the terms, (p, k)."""
-        return np.real(self.terms.fields.conj().T @ g) + np.real(
-            self.terms.plates.conj().T @ a
-        )
+        return np.real(self.fields.conj().T @ g) + np.real(self.plates.conj().T @ a)
 
     def functionals(
         self, sites: np.ndarray, marks: np.ndarray | None = None
@@ -354,7 +324,7 @@ class MapsCovariance:
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
         """
         grid = self.system.grid
-        of_coefficients = -self.terms.covariance @ self.of_terms(g, a)
+        of_coefficients = -self.covariance_of_terms @ self.of_terms(g, a)
         g, misalignments = grid.functionals(g, a)
         parameters = self._p @ misalignments
         return grid.solve(g) - grid.response @ parameters, parameters, of_coefficients
@@ -367,17 +337,17 @@ class MapsCovariance:
         fields, g, a = self._datum(plate=plate)
         field, parameters, of_coefficients = self._solved(g, a)
         answer = grid.response
-        of_terms = self.terms.fields
+        of_terms = self.fields
         if plate:
             noise = grid.noise_of_means
             field = self._plates(field, parameters) + noise[:, None] * a
             own_variance = noise + grid.variance_of_means
-            of_terms = self.terms.plates
+            of_terms = self.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
             z, known_places = grid.views.z, self.system.known_marks
         variance = in_datum(
             own_variance,
-            ((answer, self._p), (of_terms, self.terms.covariance)),
+            ((answer, self._p), (of_terms, self.covariance_of_terms)),
             field - of_terms @ of_coefficients,
             fields,
             self.of_free(g, a),
@@ -589,9 +559,12 @@ class LinesCovariance:
     def terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Free angular maps of stage and plate for a unit of each coefficient, (K, p)."""
         terms = self.cover.terms
-        field = -self.cover.terms.turned
-        phi = terms.parameters[self.system.phi_at] / self.cover.length
-        return field, self.angular.plate(terms.lines, field.T, phi.T)[0].T
+        if terms is None:
+            none = np.zeros((self.angular.n_lines, 0))
+            return none, none
+        lines = terms.columns.lines
+        plates = terms.projected.of_lines(self.system, lines, self.cover.length)[0]
+        return -terms.projected.turned, plates.T
 
     def stage_of_terms(self, conditions: Conditions) -> np.ndarray:
         """Return Gtheta in its datum for a unit of each coefficient, (K, p)."""
@@ -684,7 +657,7 @@ class LinesCovariance:
             factors[: len(of_maps)] += of_maps
             of_terms = of_terms + terms_of_maps
         cov += self._xy2 * (factors.T @ self.cover.inverse @ factors)
-        cov += self._xy2 * (of_terms.T @ self.cover.terms.covariance @ of_terms)
+        cov += self._xy2 * (of_terms.T @ self.cover.covariance_of_terms @ of_terms)
         return (cov + cov.T) / 2
 
 

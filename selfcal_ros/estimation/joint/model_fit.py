@@ -22,7 +22,6 @@ import numpy as np
 
 from selfcal_ros.blocks import Block, block_of
 from selfcal_ros.errors import NotSettledError
-from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
     DECLARED_DOF,
     NEGLIGIBLE,
@@ -107,38 +106,6 @@ class ModelFit:
             if visits is not None:
                 y = visits.y - of_terms[row]
                 yield row, visits, visits.about_means(y[None], n_marks)[0]
-
-    @property
-    def spread(self) -> TermSpread:
-        """What the terms' uncertainty does to the maps."""
-        now = equations_of(self.problem, self.fitted, self.equations.columns)
-        return spread_of(now, now.inverse(self.fitted.xy.sigma))
-
-
-def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
-    """Return what coefficients with a covariance, (p, p) for unit noise, do to the maps."""
-    system, fit, columns = equations.system, equations.projected, equations.columns
-    on_lines = np.zeros((equations.n, *system.angular.weight.shape))
-    if len(columns.lines.at):
-        on_lines[columns.lines.at] = columns.lines.values
-    plates = [
-        system.grid.plate(*effects)[0].ravel()
-        for effects in zip(
-            columns.grid,
-            fit.fields.T.reshape(-1, *system.grid.views.shape),
-            fit.parameters[: 3 * system.grid.n_views].T,
-            strict=True,
-        )
-    ]
-    return TermSpread(
-        columns=columns.grid,
-        lines=on_lines,
-        fields=fit.fields,
-        plates=np.array(plates).reshape(-1, system.grid.n_marks).T,
-        parameters=fit.parameters,
-        turned=fit.turned,
-        covariance=covariance,
-    )
 
 
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
@@ -468,7 +435,7 @@ def _of_lines(
     angular = problem.system.angular
     columns = equations.projected.of_lines(
         system, equations.columns.lines, problem.half_width_m
-    )
+    )[1]
     weight = equations.line_weight * angular.weight
     rotations = (
         fitted.ratio

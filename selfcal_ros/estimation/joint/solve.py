@@ -528,7 +528,7 @@ def _solved(
             problem.system,
             fitted.inverse,
             options.reference,
-            terms=model.spread if problem.terms else None,
+            terms=model.equations if problem.terms else None,
             half_width_m=problem.half_width_m,
             sigma_m=least,
         )
@@ -736,7 +736,7 @@ def _error_map(
             variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if with_uncertainty else u_theta
         if with_uncertainty and problem.terms:
-            roots = roots_by_term(cover.terms.covariance, model.equations.columns)
+            roots = roots_by_term(cover.covariance_of_terms, model.equations.columns)
             beside_map = _beside_map(model, lines, measurements.sense)
             kept_parts = replace(
                 kept_parts,

@@ -22,7 +22,7 @@ from scipy.special import fdtri
 
 from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import NoDataError, NotIdentifiableError, NotSettledError
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess
@@ -339,8 +339,8 @@ def _fitted(
     fields, parameters = (
         np.stack(solutions_of, axis=1) for solutions_of in zip(*drawn, strict=True)
     )
-    now = equations_of(problem, joint_fit, model.equations.columns)
-    shapes = now.columns.shapes
+    equations = model.equations
+    shapes = equations.columns.shapes
     right = np.stack(
         [
             shapes.against(shapes.sums(grid.weight * grid.plate(draw, *fitted)[1]))
@@ -348,20 +348,20 @@ def _fitted(
         ],
         axis=1,
     )
-    values, vectors = np.linalg.eigh(now.columns.within.gram)
+    values, vectors = np.linalg.eigh(equations.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
-    right += within @ rng.standard_normal((now.n, len(noise)))
-    feigned = np.sqrt(now.position_noise)[:, None]
-    right = now.unbiased_sums(
-        right + feigned * rng.standard_normal((now.n, len(noise)))
+    right += within @ rng.standard_normal((equations.n, len(noise)))
+    feigned = np.sqrt(equations.position_noise)[:, None]
+    right = equations.unbiased_sums(
+        right + feigned * rng.standard_normal((equations.n, len(noise)))
     )
     # a term with a size is not 0: its estimate minus its value is drawn
-    prior = np.where(now.free, 0.0, joint_fit.xy.sigma / now.columns.size)
-    right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
-    coefficients = now.inverse(joint_fit.xy.sigma) @ right
+    prior = np.where(equations.free, 0.0, joint_fit.xy.sigma / equations.columns.size)
+    right -= prior[:, None] * rng.standard_normal((equations.n, len(noise)))
+    coefficients = equations.inverse(joint_fit.xy.sigma) @ right
     return (
-        fields - now.projected.fields @ coefficients,
-        parameters - now.projected.parameters[:n] @ coefficients,
+        fields - equations.projected.fields @ coefficients,
+        parameters - equations.projected.parameters[:n] @ coefficients,
         coefficients,
     )
 

@@ -166,13 +166,13 @@ class ProjectedColumns:
 
     def of_lines(
         self, system: NormalEquations, lines: LineColumns, half_width_m: float
-    ) -> np.ndarray:
-        """Return the angular residuals of the columns, (p, views, K), rad."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the plate's lines (p, K) and the residuals (p, views, K) of the columns, rad."""
         y = np.zeros((len(self.gram), *system.angular.weight.shape))
         if len(lines.at):
             y[lines.at] = lines.values
         phi = self.parameters[system.phi_at] / half_width_m
-        return system.angular.plate(y, -self.turned.T, phi.T)[1]
+        return system.angular.plate(y, -self.turned.T, phi.T)
 
 
 def project(
@@ -373,6 +373,18 @@ class TermEquations:
             self.system.grid.n_readings * power * marks,
             self.system.angular.n_views * power * lines,
         )
+
+    @cached_property
+    def plates(self) -> np.ndarray:
+        """Plate for a unit of each coefficient, beside `projected.fields`, complex (marks, p)."""
+        grid = self.system.grid
+        fields = self.projected.fields.T.reshape(-1, *grid.views.shape)
+        parameters = self.projected.parameters[: 3 * grid.n_views].T
+        plates = [
+            grid.plate(*effects)[0].ravel()
+            for effects in zip(self.columns.grid, fields, parameters, strict=True)
+        ]
+        return np.array(plates).reshape(-1, grid.n_marks).T
 
     @cached_property
     def maps(self) -> np.ndarray:

@@ -821,7 +821,7 @@ def fitted_term(
     model: ModelFit, name: str, p: float = 1.0, *, determined: bool = True
 ) -> Explanation:
     """Return a term of the model with its fitted coefficients and its effect."""
-    equations = equations_of(model.problem, model.fitted, model.equations.columns)
+    equations = model.equations
     rows = equations.rows([name])
     covariance = model.covariance[np.ix_(rows, rows)] * model.fitted.xy.sigma**2
     columns = tuple(compress(equations.columns.columns, rows))

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.model_fit import equations_of, spread_of
+from selfcal_ros.estimation.joint.model_fit import equations_of
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE
 from selfcal_ros.estimation.joint.solve import Solved
 from selfcal_ros.estimation.options import Options
@@ -49,18 +49,18 @@ def undetermined_effects(solved: Solved, options: Options) -> Iterator[Effect]:
     for term in more:
         columns = term_columns(problem.inputs, (*problem.terms, term))
         equations = equations_of(problem, fitted, columns)
-        covariance = equations.inverse(fitted.xy.sigma)
-        maps = MapsCovariance(
+        cover = MapsCovariance(
             problem.system,
             fitted.inverse,
             options.reference,
             half_width_m=problem.half_width_m,
-            terms=spread_of(equations, covariance),
-        ).maps_of_terms()
-        coordinates = np.concatenate(
-            [component for values in maps for component in (values.real, values.imag)]
+            sigma_m=fitted.xy.sigma,
+            terms=equations,
         )
-        root = fitted.xy.sigma * root_of(covariance, equations.rows([term.name]))
+        stage, plate = cover.maps_of_terms()
+        coordinates = np.concatenate([stage.real, stage.imag, plate.real, plate.imag])
+        rows = equations.rows([term.name])
+        root = fitted.xy.sigma * root_of(cover.covariance_of_terms, rows)
         directions, size, _ = np.linalg.svd(coordinates @ root, full_matrices=False)
         added = (directions * size).T[size > NEGLIGIBLE * size.max(initial=0.0)]
         if np.sqrt((added[:, : 2 * emap.gx.size] ** 2).sum(axis=0).mean()) > least:
