@@ -389,11 +389,12 @@ class _Family:
 
 
 def _families(
-    values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray, shapes: np.ndarray
+    runs: list[RunValues], q: np.ndarray, shapes: np.ndarray
 ) -> list[_Family]:
     """Return the families of values: one for each shape, and what is left, if anything is."""
+    values = np.stack([run.values for run in runs])
     amplitude = values @ shapes
-    within = np.stack([variances_of(c, shapes) for c in covariances])
+    within = np.stack([variances_of(run.covariance, shapes) for run in runs])
     families = [
         _Family(amplitude[:, [m]], within[:, m], shape**2, 1)
         for m, shape in enumerate(shapes.T)
@@ -401,7 +402,7 @@ def _families(
     removed = np.concatenate([q, shapes], axis=1)
     n_rest = len(removed) - removed.shape[1]
     if n_rest:
-        total = np.array([variances(c).sum() for c in covariances])
+        total = np.array([variances(run.covariance).sum() for run in runs])
         families.append(
             _Family(
                 (values - amplitude @ shapes.T) * np.sqrt(len(removed) / n_rest),
@@ -426,28 +427,29 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         Shapes whose amplitudes vary between runs each by its own; the rest has one variance.
     """
     q, shapes = independent_of(removed, shapes)
-    values = np.stack([run.values - q @ (q.T @ run.values) for run in runs])
-    covariances = [without(run.covariance, q) for run in runs]
-    shares = np.array([run.shares for run in runs], dtype=float)
-    families = _families(values, covariances, q, shapes)
+    runs = [
+        replace(
+            run,
+            values=run.values - q @ (q.T @ run.values),
+            covariance=without(run.covariance, q),
+            common=without(run.common, q),
+        )
+        for run in runs
+    ]
+    families = _families(runs, q, shapes)
     spread = np.sum([family.between * family.share for family in families], axis=0)
     weights = 1 / np.maximum(
-        [variances(c).sum() + spread.sum() for c in covariances], TINY
+        [variances(run.covariance).sum() + spread.sum() for run in runs], TINY
     )
     weights = weights / weights.sum()
-    shared = [without(run.common, q) for run in runs if run.shares]
-    common = _sum(
-        [np.zeros(len(q)), *shared],
-        np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)),
+    together = _Runs(runs, weights, q)
+    pooled, shared = weights**2, weights @ together.shares
+    within = sum(
+        w * variances(run.covariance) for w, run in zip(pooled, runs, strict=True)
     )
-    pooled = weights**2
-    power_within = sum(
-        w * variances(c) for w, c in zip(pooled, covariances, strict=True)
-    )
+    common = shared**2 * variances(together.common)
     between = pooled.sum() * spread
-    covariance = _sum(
-        [*covariances, common], np.append(pooled, (weights @ shares) ** 2)
-    )
+    covariance = together.total(pooled, shared)
     added = spread
     if covariance.ndim == 2:
         of_shapes = np.array([family.between for family in families[: shapes.shape[1]]])
@@ -455,37 +457,164 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         added = (shapes * of_shapes) @ shapes.T + of_rest * (
             np.eye(len(q)) - q @ q.T - shapes @ shapes.T
         )
-    covariance = covariance + pooled.sum() * added
-    shared_part = (weights @ shares) ** 2 * variances(common)
-    p = _p_between(families, runs, covariances)
+    p = together.p_between(families)
     of_one = max(
         families[: shapes.shape[1]], key=lambda family: family.between, default=None
     )
     if p < USUAL_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
-        dof = _dof_of_single(of_one, weights, shared_part)
+        dof = _dof_of_single(of_one, weights, common)
     else:
-        dof = _dof(
-            runs,
-            covariances,
-            families,
-            weights,
-            power=power_within + shared_part + between,
-        )
+        dof = together.dof(families, within + common + between)
     return Mean(
-        values=weights @ values,
-        covariance=covariance,
-        within=power_within,
-        common=shared_part,
+        values=weights @ together.values,
+        covariance=covariance + pooled.sum() * added,
+        within=within,
+        common=common,
         between=between,
         u_between=float(np.sqrt(spread.mean())),
         p_between=p,
         weights=weights,
         dof=dof,
-        deviations=tuple(
-            _deviation(i, runs, values, covariances, common, weights, q, added)
-            for i in range(len(runs))
-        ),
+        deviations=tuple(together.deviation(i, added) for i in range(len(runs))),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Runs without their datum, and the weights of their mean.
+
+    Attributes
+    ----------
+    runs : list of RunValues
+        The runs.
+    weights : float array (runs,)
+        Weights, sum 1.
+    q : float array (d, r)
+        Orthonormal columns of the datum.
+    """
+
+    runs: list[RunValues]
+    weights: np.ndarray
+    q: np.ndarray
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """The values, (runs, d)."""
+        return np.stack([run.values for run in self.runs])
+
+    @cached_property
+    def shares(self) -> np.ndarray:
+        """1 for each run that has a common part, else 0, (runs,)."""
+        return np.array([run.shares for run in self.runs], dtype=float)
+
+    @cached_property
+    def common(self) -> np.ndarray:
+        """Covariance of the common part, the weighted mean of those that have one."""
+        weights = self.weights * self.shares
+        return _sum(
+            [run.common for run in self.runs], weights / max(weights.sum(), TINY)
+        )
+
+    def total(self, factors: np.ndarray, shared: float = 0.0) -> np.ndarray:
+        """Return the covariance of a combination of runs.
+
+        `factors` are the squares of those of the runs, `shared` is that of the common part.
+        """
+        return _sum(
+            [*(run.covariance for run in self.runs), self.common],
+            np.append(factors, shared**2),
+        )
+
+    def noise_dof(self, factors: np.ndarray) -> float:
+        """Return the degrees of freedom of a sum of covariances (Welch-Satterthwaite)."""
+        power = [
+            float(f * variances(run.covariance).mean())
+            for f, run in zip(factors, self.runs, strict=True)
+        ]
+        dof_of_runs = [run.dof for run in self.runs]
+        return min(joint_dof(*zip(power, dof_of_runs, strict=True)), MANY_DOF)
+
+    def p_between(self, families: list[_Family]) -> float:
+        """Return the probability of the scatter by chance: the worst family's, Bonferroni."""
+        all_alike = np.ones(len(self.runs))
+        dof, total = self.noise_dof(all_alike), self.total(all_alike)
+        probabilities = []
+        for family in families:
+            k = len(self.runs) - 1
+            scatter = _scatter(family.values, family.within)
+            probabilities.append(
+                float(fdtrc(k * family.number(total), dof, scatter / k))
+            )
+        return min(1.0, len(probabilities) * min(probabilities, default=1.0))
+
+    def dof(self, families: list[_Family], power: np.ndarray) -> float:
+        """Return the degrees of freedom of the mean's u, the median of all values.
+
+        A variance between runs is a difference: its uncertainty is that of the scatter between
+        runs, which contains the part within runs, with one degree of freedom less than there are
+        runs. `power` is the variance of the mean, (d,).
+        """
+        pooled = self.total(self.weights**2)
+        terms = np.zeros(len(power))
+        for family in families:
+            k = (len(self.runs) - 1) * family.number(pooled)
+            terms = terms + _scatter_of_mean(family, self.weights) ** 2 / k
+        for run, w in zip(self.runs, self.weights, strict=True):
+            if 0 < run.dof < MANY_DOF:
+                terms = terms + (w**2 * variances(run.covariance)) ** 2 / run.dof
+        of_values = (power**2 / np.maximum(terms, TINY))[power > 0]
+        return (
+            min(float(np.median(of_values)), MANY_DOF) if len(of_values) else MANY_DOF
+        )
+
+    def deviation(self, i: int, between: np.ndarray) -> Deviation:
+        """Return the deviation of run i from the weighted mean of the others.
+
+        `between` is the covariance of the part between runs.
+        """
+        this = np.arange(len(self.runs)) == i
+        others = np.where(this, 0.0, self.weights)
+        others = others / others.sum()
+        deviation = self.values[i] - others @ self.values
+        factors = others**2 + this
+        total = self.total(factors, self.shares[i] - others @ self.shares)
+        dof = self.noise_dof(factors)
+        full = all(run.covariance.ndim == 2 for run in self.runs)
+        test = significance(
+            deviation, ReducedNoise(total if full else variances(total), self.q, dof)
+        )
+        e_n = np.zeros_like(deviation)
+        expanded_u = coverage_factor(dof) * np.sqrt(variances(total))
+        np.divide(deviation, expanded_u, out=e_n, where=expanded_u > 0)
+        return Deviation(e_n, test, self.p_scatter(i, others, between))
+
+    def p_scatter(self, i: int, weights: np.ndarray, between: np.ndarray) -> float:
+        """Return the probability that run i is so much farther from the mean than the others are.
+
+        Ratio of its squared distance from the mean of the others, with these `weights`, to the
+        scatter of these, each over its expectation, as F with the number of independent values in
+        each run (Box).
+        """
+        runs = len(self.runs)
+        if runs < 3:
+            return float("nan")
+        power = (
+            np.array([variances(run.covariance).sum() for run in self.runs])
+            + variances(between).sum()
+        )
+        squares = ((self.values - weights @ self.values) ** 2).sum(axis=1)
+        of_mean = weights**2 @ power
+        others = np.arange(runs) != i
+        expected = ((1 - 2 * weights[others]) * power[others] + of_mean).sum()
+        ratio = (
+            squares[i]
+            / max(power[i] + of_mean, TINY)
+            / max(squares[others].sum() / max(expected, TINY), TINY)
+        )
+        covariances = [run.covariance for run in self.runs]
+        total = _sum([*covariances, between], np.append(np.full(runs, 1 / runs), 1.0))
+        number = max(_independent_number(total), 1.0)
+        return float(fdtrc(number, number * (runs - 2), ratio))
 
 
 def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
@@ -497,60 +626,6 @@ def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
             for f, c in zip(factors, covariances, strict=True)
         ],
         axis=0,
-    )
-
-
-def _p_between(
-    families: list[_Family], runs: list[RunValues], covariances: list[np.ndarray]
-) -> float:
-    """Return the probability of the scatter between runs by chance: the worst, Bonferroni."""
-    dof = _noise_dof(runs, covariances, np.ones(len(runs)))
-    total = _sum(covariances, np.ones(len(covariances)))
-    probabilities = []
-    for family in families:
-        k = len(runs) - 1
-        scatter = _scatter(family.values, family.within)
-        probabilities.append(float(fdtrc(k * family.number(total), dof, scatter / k)))
-    return min(1.0, len(probabilities) * min(probabilities, default=1.0))
-
-
-def _noise_dof(
-    runs: list[RunValues], covariances: list[np.ndarray], factors: np.ndarray
-) -> float:
-    """Return the degrees of freedom of a sum of the runs' covariances (Welch-Satterthwaite)."""
-    power = [
-        float(f * variances(c).mean())
-        for f, c in zip(factors, covariances, strict=True)
-    ]
-    return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
-
-
-def _dof(
-    runs: list[RunValues],
-    covariances: list[np.ndarray],
-    families: list[_Family],
-    weights: np.ndarray,
-    *,
-    power: np.ndarray,
-) -> float:
-    """Return the degrees of freedom of the mean's u, the median of all values.
-
-    A variance between runs is a difference: its uncertainty is that of the scatter between runs,
-    which contains the part within runs, with one degree of freedom less than there are runs.
-    """
-    pooled = _sum(covariances, weights**2)
-    terms = np.zeros(len(power))
-    for family in families:
-        k = (len(runs) - 1) * family.number(pooled)
-        terms = terms + _scatter_of_mean(family, weights) ** 2 / k
-    for run, c, w in zip(runs, covariances, weights, strict=True):
-        if 0 < run.dof < MANY_DOF:
-            terms = terms + (w**2 * variances(c)) ** 2 / run.dof
-    dof_of_values = (power**2 / np.maximum(terms, TINY))[power > 0]
-    return (
-        min(float(np.median(dof_of_values)), MANY_DOF)
-        if len(dof_of_values)
-        else MANY_DOF
     )
 
 
@@ -571,75 +646,6 @@ def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> 
     scatter = _scatter_of_mean(family, weights)
     ratio = float(np.min(shared[scatter > 0] / scatter[scatter > 0]))
     return min((len(weights) - 1) * (1 + ratio) ** 2, MANY_DOF)
-
-
-def _deviation(
-    i: int,
-    runs: list[RunValues],
-    values: np.ndarray,
-    covariances: list[np.ndarray],
-    common: np.ndarray,
-    weights: np.ndarray,
-    q: np.ndarray,
-    between: np.ndarray,
-) -> Deviation:
-    """Return the deviation of run i from the weighted mean of the others."""
-    weights_of_others = np.where(np.arange(len(runs)) == i, 0.0, weights)
-    weights_of_others = weights_of_others / weights_of_others.sum()
-    deviation = values[i] - weights_of_others @ values
-    factors = weights_of_others**2 + (np.arange(len(runs)) == i)
-    shares = np.array([run.shares for run in runs], dtype=float)
-    total = _sum(
-        [*covariances, common],
-        np.append(factors, (shares[i] - weights_of_others @ shares) ** 2),
-    )
-    dof = _noise_dof(runs, covariances, factors)
-    full = all(run.covariance.ndim == 2 for run in runs)
-    test = significance(
-        deviation, ReducedNoise(total if full else variances(total), q, dof)
-    )
-    u = np.sqrt(variances(total))
-    e_n = np.divide(
-        deviation, coverage_factor(dof) * u, out=np.zeros_like(deviation), where=u > 0
-    )
-    return Deviation(
-        e_n, test, _p_scatter(i, values, covariances, weights_of_others, between)
-    )
-
-
-def _p_scatter(
-    i: int,
-    values: np.ndarray,
-    covariances: list[np.ndarray],
-    weights_of_others: np.ndarray,
-    between: np.ndarray,
-) -> float:
-    """Return the probability that run i is so much farther from the mean than the others are.
-
-    Ratio of its squared distance from the mean of the others to the scatter of these, each over
-    its expectation, as F with the number of independent values in each run (Box).
-    """
-    runs = len(values)
-    if runs < 3:
-        return float("nan")
-    power = np.array(
-        [variances(c).sum() + variances(between).sum() for c in covariances]
-    )
-    mean = weights_of_others @ values
-    of_mean = weights_of_others**2 @ power
-    other_runs = np.flatnonzero(np.arange(runs) != i)
-    scatter = ((values[other_runs] - mean) ** 2).sum()
-    expected = (
-        (1 - 2 * weights_of_others[other_runs]) * power[other_runs] + of_mean
-    ).sum()
-    ratio = (
-        ((values[i] - mean) ** 2).sum()
-        / max(power[i] + of_mean, TINY)
-        / max(scatter / max(expected, TINY), TINY)
-    )
-    total = _sum([*covariances, between], np.append(np.full(runs, 1 / runs), 1.0))
-    number = max(_independent_number(total), 1.0)
-    return float(fdtrc(number, number * (runs - 2), ratio))
 
 
 BETWEEN = "between_runs"

@@ -732,7 +732,11 @@ def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
     variances = np.array([3.0, 1.0, 2.0, 4.0, 6.0, 8.0]) * 1e-16
     free = basis[:, 2:]
     values = rng.normal(size=(3, 6)) @ free.T
-    *of_shapes, rest = _families(values, [free * variances @ free.T] * 3, q, shapes)
+    runs = [
+        replace(run_of(one, 0.0), covariance=free * variances @ free.T)
+        for one in values
+    ]
+    *of_shapes, rest = _families(runs, q, shapes)
     np.testing.assert_allclose(
         [family.within[0] for family in of_shapes], [3e-16, 1e-16]
     )
