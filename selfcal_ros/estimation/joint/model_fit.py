@@ -154,16 +154,20 @@ def equations_of(
     problem: Problem, fitted: JointFit, columns: TermColumns
 ) -> TermEquations:
     """Return the equations of columns about the estimate `fitted`."""
-    noises = filter(
-        np.isfinite, (fitted.xy.declared, fitted.xy.repeats, fitted.xy.residuals)
-    )
+    noise = fitted.xy
+    # identical repeats show a sensor's resolution: no offset would be noise
+    shown = [
+        sigma
+        for sigma in (noise.declared, noise.repeats, noise.residuals)
+        if sigma > FLOOR
+    ]
     return equations_of_columns(
         problem.system,
         columns,
         fitted.inverse,
         ratio=fitted.ratio,
         half_width_m=problem.half_width_m,
-        noise_m=min(noises, default=0.0),
+        noise_m=min(shown, default=0.0),
     )
 
 

@@ -198,6 +198,42 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
 
 
+def repeated_to_the_bit(readings):
+    """Return the readings of a detector that answers a second visit with its first answer."""
+    views = []
+    for view in readings.views:
+        visits = view.visits
+        if visits is None:
+            views.append(view)
+            continue
+        first = np.searchsorted(visits.mark, np.arange(len(view.m)))
+        same = {
+            name: getattr(visits, name)[first[visits.mark]]
+            for name in ("dx", "dy", "offset_x", "offset_y")
+        }
+        views.append(
+            replace(
+                view,
+                dx=visits.dx[first],
+                dy=visits.dy[first],
+                sigma_xy=0.0,
+                motion=replace(view.motion, products=np.zeros((4, 4))),
+                visits=replace(visits, **same),
+            )
+        )
+    return replace(readings, views=tuple(views))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_identical_repeats_show_no_sign(seed):
+    """Their noise is not known from them, and must not pass for offsets that the stage made."""
+    readings = repeated_to_the_bit(offsets_of(0.0, 1e-4, repeats=2, seed=seed))
+    for one in (readings, turned_readings(readings, Turned(-np.eye(2), 1, "opposite"))):
+        assert "sign_not_shown" in [
+            failed.name for failed in calibrate(one, Options()).verdict.failed
+        ]
+
+
 @pytest.mark.parametrize(
     ("scatter", "repeats", "by_lines"),
     [
