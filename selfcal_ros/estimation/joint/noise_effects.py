@@ -81,8 +81,20 @@ def structured(
 
         added = contrast * added_variances(cover, along_x, rows)
     if slow_motion(model) is None and len(correlation := time_correlation(model)):
-        added = added + correlated_variances(model, cover, correlation, rows)
+        correlated = correlated_variances(model, cover, correlation, rows)
+        # what it takes off is a share of either axis' noise, not of their mean
+        taken_off = np.minimum(correlated, 0.0) * added / _variances(cover, rows)
+        added = added + correlated + taken_off
     return added + image_variances(model, cover, rows)
+
+
+def _variances(
+    cover: MapsCovariance, rows: np.ndarray | None, *, plate: bool = False
+) -> np.ndarray:
+    """Return the variances of white noise, for unit noise; parameters as `added_variances`."""
+    if rows is not None:
+        return np.diag(cover.of(rows))
+    return cover.of_plate if plate else cover.of_stage
 
 
 def image_variances(
@@ -103,11 +115,7 @@ def image_variances(
     if images is None or not (share := images.noises(model.fitted.residuals).share):
         return 0.0
     added = added_variances(cover, images.added, rows, plate=plate)
-    variance = (
-        (cover.of_plate if plate else cover.of_stage)
-        if rows is None
-        else np.diag(cover.of(rows))
-    )
+    variance = _variances(cover, rows, plate=plate)
     if (added < -variance).any():
         of_marks = added_variances(cover, images.of_marks, rows, plate=plate)
         added = added * np.minimum(

@@ -91,3 +91,21 @@ def test_the_correlation_is_that_of_the_noise():
     assert slow[0] > 0.4 and slow[0] > slow[10] > slow[100]
     for seed in range(3):
         assert not len(time_correlation(fit_joint(measured(7, seed)[1], Options())))
+
+
+@pytest.mark.parametrize("contrast", [-0.995, 0.995])
+def test_what_correlation_takes_off_is_a_share_of_the_noise_of_each_axis(
+    monkeypatch, contrast
+):
+    """Of their mean it would be more than the quiet axis has, and u of some nodes 0."""
+    _, readings = measured(5)
+    smooth = Options(assumed=(), causes=False, misalignment_model="linear")
+    monkeypatch.setattr(noise_effects, "axis_contrast", lambda model: contrast)
+    maps = []
+    for correlation in ([], 0.92 ** np.arange(1, 12)):
+        monkeypatch.setattr(
+            noise_effects, "time_correlation", lambda model, c=correlation: c
+        )
+        emap = solve_joint(readings, smooth).result.error_map
+        maps.append(np.minimum(emap.u_gx, emap.u_gy))
+    assert (maps[1] > 0.3 * maps[0]).all()
