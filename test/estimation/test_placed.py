@@ -415,6 +415,22 @@ def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, untested)
     assert RoughnessUntested() not in calibrate(exact, BARE).verdict.failed
 
 
+@pytest.mark.parametrize(("side", "untested"), [(4, True), (7, False)])
+def test_few_marks_do_not_test_the_nodes_of_a_bilinear_map(side, untested):
+    """Of 4 x 4 marks in three views 24 equations are left, of which misalignments take some."""
+    poses = ((0, (0, 0)), (37, (0.3, 0.1)), (90, (-0.2, 0.4)))
+    measurements, _ = readings(
+        plate(side, 3, "bilinear"),
+        poses,
+        np.random.default_rng(5),
+        stage=lambda z: 1e-7 * z,
+    )
+    often = repeated(measurements, 20e-9, repeats=4)
+    for one in (measurements, often):
+        failed = calibrate(one, Options()).verdict.failed
+        assert (RoughnessUntested() in failed) is untested
+
+
 @pytest.mark.parametrize("nodes", ["2", "-7", "7.0", "٧", ""])
 def test_numbers_of_nodes_that_are_none_are_refused(nodes):
     with pytest.raises(InputError, match="is not NODES"):

@@ -44,6 +44,9 @@ from selfcal_ros.model.view import View
 TRACE = 1e-6
 """Part of a whole, or of a misalignment of unit length, that counts as none: rounding is 1e-9."""
 
+FEWEST_LEFT = 30
+"""Readings beyond the unknowns from which a smooth map tests the nodes of a bilinear one."""
+
 FULL_SIZE = 41
 """Sites per side of the largest field in which everything is tried, causes and candidates, in a
 second; of a larger one its middle, or a smaller field of its shape, stands for it."""
@@ -593,7 +596,9 @@ class PlacedEquations(NormalEquations):
         if grid.too_large_to_refine:
             return True
         n_left = grid.equations_of_map
-        if spline.axes[0].degree == 1 or n_left > 2 * math.prod(spline.refined.shape):
+        if spline.axes[0].degree == 1:  # a smooth map of the same nodes tests them
+            return n_left - self.determined_coefficients < FEWEST_LEFT
+        if n_left > 2 * math.prod(spline.refined.shape):
             return False
         fine = PlacedSystem(
             grid.views.artifact, grid.views.poses, grid.weight, spline.refined
