@@ -352,6 +352,10 @@ class VisitedOnce(Finding):
     """Each mark was visited once in a view."""
 
 
+class ApproachUnknown(Finding):
+    """The encoder does not show from which side most marks were approached."""
+
+
 @dataclass(frozen=True)
 class FewReadCell:
     """A cell of images, in a view or in all of them: marks `read` of those `shown`."""

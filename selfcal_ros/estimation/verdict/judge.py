@@ -63,6 +63,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 from selfcal_ros.estimation.verdict.undetermined import undetermined_effects
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.findings import (
+    ApproachUnknown,
     AxesNotMet,
     Cause,
     Finding,
@@ -523,7 +524,7 @@ def _noise_findings(solved: Solved) -> Iterator[Finding]:
 
 
 def _visits_findings(solved: Solved) -> Iterator[Finding]:
-    """Yield a finding if all repeats of each mark belong to one visit."""
+    """Yield a finding if all repeats of each mark are one visit, or approaches are not known."""
     if solved.model is None:
         return
     problem = solved.model.problem
@@ -534,6 +535,9 @@ def _visits_findings(solved: Solved) -> Iterator[Finding]:
     )
     if visited_once and not time_fitted and problem.repeats_xy[1] > 0:
         yield VisitedOnce()
+    unknown = [(v.approach_x == 0) | (v.approach_y == 0) for v in visits]
+    if visits and np.concatenate(unknown).mean() > 0.5:
+        yield ApproachUnknown()
 
 
 def views_findings(measurements: Measurements) -> Iterator[Finding]:

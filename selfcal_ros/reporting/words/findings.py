@@ -14,6 +14,7 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
 from selfcal_ros.model.budget import BudgetLine, OfAssumption, OfTerm
 from selfcal_ros.model.findings import (
+    ApproachUnknown,
     AxesNotMet,
     BetweenRuns,
     Cause,
@@ -284,8 +285,8 @@ FIXED: dict[type, str] = {
     RoughnessUntested: (
         "whether the nodes of the map suffice for the stage was not tested, and U has no "
         "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
-        "readings too few, for a finer map, and no repeats test the residuals; read every mark "
-        "twice, or give the map fewer nodes"
+        "readings too few, for a finer map, and no repeats, or too few residuals, test the map; "
+        "read every mark twice, add marks or views, or give the map fewer nodes"
     ),
     HarmonicsUntested: (
         "whether the harmonics of the angular map suffice for the rotary encoder was not tested, "
@@ -296,6 +297,12 @@ FIXED: dict[type, str] = {
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
         "marks there and back, along x and along y"
+    ),
+    ApproachUnknown: (
+        "the encoder was not recorded on the way to most marks: from which side the stage came is "
+        "not known, and an error that depends on it (backlash, settling, late stamps) may be in "
+        "the map; record the encoder throughout, with more than four samples from one exposure "
+        "to the next and no gap above max_encoder_gap"
     ),
     OutliersKept: "removing more outliers would leave the stage undetermined",
     RestNotConverged: "cannot be held out: the rest does not converge",

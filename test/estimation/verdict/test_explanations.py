@@ -12,7 +12,7 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.causes import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.findings import VisitedOnce
+from selfcal_ros.model.findings import ApproachUnknown, VisitedOnce
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
@@ -261,6 +261,29 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
     assert result.findings == ((VisitedOnce(),) if said else ())
+
+
+@pytest.mark.parametrize(("known", "said"), [(0, True), (2, True), (4, False)])
+def test_an_encoder_without_the_ways_to_the_marks_is_said_to_hide_backlash(known, said):
+    """Of five visits `known` have a direction of approach along x."""
+    plan, rng = plan_of("there_and_back", 4), np.random.default_rng(1)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, len(plan.views), rng, CLEAN),
+        plan,
+        rng,
+        visits=True,
+        settings=SETTINGS,
+    )
+    views = list(readings.views)
+    for at, view in enumerate(views):
+        if view.visits is not None:
+            is_known = np.arange(len(view.visits.mark)) % 5 < known
+            signs = (view.visits.approach_x * is_known).astype(np.int8)
+            visits = replace(view.visits, approach_x=signs)
+            views[at] = replace(view, visits=visits)
+    result = calibrate(replace(readings, views=tuple(views)), OPTIONS)
+    assert result.verdict.qualified
+    assert result.findings == ((ApproachUnknown(),) if said else ())
 
 
 def test_a_term_on_which_no_reading_depends_is_said_to_be_left_out():
