@@ -757,9 +757,10 @@ def _noise(
     if images is not None:
         before = replace(before, sigma_xy=float(np.sqrt(images.mark + images.motion)))
         of_marks, of_mark = images.repeats(*of_marks), nan
-    for kind, repeats, declared in (
-        ("xy", of_marks, of_mark),
-        ("theta", problem.repeats_theta, problem.angular.sigma_declared),
+    lines = problem.angular
+    for kind, repeats, declared, weight in (
+        ("xy", of_marks, of_mark, problem.grid.weight),
+        ("theta", problem.repeats_theta, lines.sigma_declared, lines.weight),
     ):
         noise = noise_estimate(repeats, (nan, 0), nan)
         sigma, dof = getattr(before, f"sigma_{kind}"), getattr(before, f"dof_{kind}")
@@ -768,7 +769,10 @@ def _noise(
             fdtrc(noise.dof, dof, (noise.sigma / sigma) ** 2) < USUAL_LEVEL
         )
         if not (many or more):
-            noise = replace(noise, sigma=sigma, dof=dof)
+            # repeats that are identical average nothing
+            identical = noise.dof_repeats > 0 and not noise.repeats > FLOOR
+            of_one = np.sqrt(weight.max()) if identical else 1.0
+            noise = replace(noise, sigma=sigma * of_one, dof=dof)
         larger = max(noise.sigma, np.nan_to_num(declared))
         out.append(replace(noise, sigma=larger, declared=declared))
     return out[0], out[1]

@@ -315,6 +315,18 @@ def test_the_noise_is_that_of_many_or_larger_repeats_or_of_the_calibration():
         assert recheck(more, linear(), plate).noise.sigma_xy == pytest.approx(sigma)
 
 
+def test_repeats_that_are_identical_average_nothing():
+    """Their mean has the noise of one reading: changes were found in five of six stages."""
+    _, after = sessions()
+    plate = known_plate(calibrated(), "r.json")
+    once = recheck(after, linear(), plate)
+    view = after.views[0]
+    same = replace(view, count=4 * view.count, sigma_xy=0.0, dof_xy=150, visits=None)
+    again = recheck(replace(after, views=(same,)), linear(), plate)
+    assert again.noise.sigma_xy == pytest.approx(2 * once.noise.sigma_xy)
+    assert again.error_map.u_gx == pytest.approx(once.error_map.u_gx)
+
+
 def test_the_noise_is_what_detections_declare_if_that_is_larger():
     """With a declaration of 60 nm that of the calibration, 19 nm, was used, as with 96 repeats."""
     _, after = sessions()
