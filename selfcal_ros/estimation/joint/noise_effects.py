@@ -17,13 +17,12 @@ from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
-    MIN_REPEAT_DOF,
     SAME,
     noise_excess,
 )
 from selfcal_ros.estimation.joint.slow_motion import slow_motion
 from selfcal_ros.estimation.normal.angular import FLOOR
-from selfcal_ros.estimation.normal.equations import BLOCK
+from selfcal_ros.estimation.normal.equations import BLOCK, ENOUGH_DOF
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 
@@ -42,7 +41,7 @@ def axis_contrast(model: ModelFit) -> float:
                 visits.weight @ np.stack([residuals.real, residuals.imag], axis=1) ** 2
             )
             dof += len(visits.mark) - len(np.unique(visits.mark))
-    if 2 * dof < MIN_REPEAT_DOF:
+    if 2 * dof < ENOUGH_DOF:
         residuals = model.fitted.residuals * model.problem.to_stage[:, None, None]
         weight = problem.system.grid.weight
         squares = np.array(

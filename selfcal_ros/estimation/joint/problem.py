@@ -24,6 +24,7 @@ from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import (
+    ENOUGH_DOF,
     NormalEquations,
     angular_residuals,
     noise_of,
@@ -43,9 +44,6 @@ from selfcal_ros.model.terms import ModelTerm
 
 DECLARED_DOF = 8.0
 """Degrees of freedom of a declared noise: it is known to a quarter (GUM G.4.2)."""
-
-MIN_REPEAT_DOF = 30
-"""Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
 NEGLIGIBLE = 1e-3
 """Part of an uncertainty, or of what makes it, that changes no stated figure."""
@@ -94,7 +92,7 @@ class NoiseEstimate:
     @property
     def exceeded(self) -> bool:
         """Whether many repeats show more noise than is declared, as of a stage that vibrates."""
-        return self.dof_repeats >= MIN_REPEAT_DOF and self.repeats > self.stated
+        return self.dof_repeats >= ENOUGH_DOF and self.repeats > self.stated
 
     @property
     def known(self) -> float:
@@ -149,7 +147,7 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the noise to use: declared, else repeats, else residuals.
 
-    Repeats have `MIN_REPEAT_DOF` degrees of freedom, or as many as the residuals have.
+    Repeats have `ENOUGH_DOF` degrees of freedom, or as many as the residuals have.
     If a test contradicts this choice, or both are too small to be tested, the larger one is used.
     Repeats that are identical, but for rounding, show the resolution of the sensor, not the noise,
     and are ignored.
@@ -174,7 +172,7 @@ def noise_estimate(
         else ((float("nan"), 0.0) if identical else repeats)
     )
     p = _same_noise(base, residuals, floor)
-    few = base[1] < min(MIN_REPEAT_DOF, residuals[1])
+    few = base[1] < min(ENOUGH_DOF, residuals[1])
     chosen = residuals if few else base
     estimate = NoiseEstimate(
         sigma=chosen[0],
@@ -333,7 +331,7 @@ def repeats_of(
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
     views = measurements.views
     return (
-        between_visits(measurements, MIN_REPEAT_DOF)
+        between_visits(measurements, ENOUGH_DOF)
         or pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
         pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
     )

@@ -44,8 +44,9 @@ from selfcal_ros.model.view import View
 TRACE = 1e-6
 """Part of a whole, or of a misalignment of unit length, that counts as none: rounding is 1e-9."""
 
-FEWEST_LEFT = 30
-"""Readings beyond the unknowns from which a smooth map tests the nodes of a bilinear one."""
+ENOUGH_DOF = 30
+"""Degrees of freedom from which a scatter is believed: that of repeats as the noise, rather than
+that of residuals; that of residuals as a test of the nodes of a bilinear map."""
 
 FULL_SIZE = 41
 """Sites per side of the largest field in which everything is tried, causes and candidates, in a
@@ -597,7 +598,7 @@ class PlacedEquations(NormalEquations):
             return True
         n_left = grid.equations_of_map
         if spline.axes[0].degree == 1:  # a smooth map of the same nodes tests them
-            return n_left - self.determined_coefficients < FEWEST_LEFT
+            return n_left - self.determined_coefficients < ENOUGH_DOF
         if n_left > 2 * math.prod(spline.refined.shape):
             return False
         fine = PlacedSystem(

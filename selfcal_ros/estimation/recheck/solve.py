@@ -22,7 +22,6 @@ from selfcal_ros.estimation.comparison.maps import USUAL_LEVEL, joint_dof, of_sq
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
-    MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
     Problem,
@@ -40,7 +39,12 @@ from selfcal_ros.estimation.lattice.readings import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import TRACE, lines_of, system_of
+from selfcal_ros.estimation.normal.equations import (
+    ENOUGH_DOF,
+    TRACE,
+    lines_of,
+    system_of,
+)
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import (
@@ -764,7 +768,7 @@ def _noise(
     ):
         noise = noise_estimate(repeats, (nan, 0), nan)
         sigma, dof = getattr(before, f"sigma_{kind}"), getattr(before, f"dof_{kind}")
-        many = noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF
+        many = noise.sigma > FLOOR and noise.dof >= ENOUGH_DOF
         more = noise.sigma > sigma > FLOOR and (
             fdtrc(noise.dof, dof, (noise.sigma / sigma) ** 2) < USUAL_LEVEL
         )

@@ -31,7 +31,6 @@ from selfcal_ros.estimation.checks.wiring import (
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.joint.problem import (
-    MIN_REPEAT_DOF,
     NEGLIGIBLE,
     SAME,
     NoiseEstimate,
@@ -44,6 +43,7 @@ from selfcal_ros.estimation.joint.solve import (
     solve_joint,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.equations import ENOUGH_DOF
 from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
@@ -219,7 +219,7 @@ def _test_the_model(noise: NoiseEstimate) -> bool:
     """Return whether residuals of marks test the model: noise is known, or there is none."""
     dof_known = np.inf if np.isfinite(noise.declared) else noise.dof_repeats
     return (
-        min(dof_known, noise.dof_residuals) >= MIN_REPEAT_DOF
+        min(dof_known, noise.dof_residuals) >= ENOUGH_DOF
         or noise.residuals < NEARLY_EXACT_M
     )
 
