@@ -25,6 +25,7 @@ from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import (
     HEALTH,
+    TOLD_TO_ALL,
     Topic,
     others_publishing,
     private,
@@ -80,7 +81,7 @@ class NodeBase[S: Settings](Answering):
         except InputError:
             self.destroy_node()  # otherwise its name stays in the graph until garbage collection
             raise
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.publisher(TOLD_TO_ALL)
         self._health = self.publisher(private(HEALTH))
         self._beat = self.every(BEAT_S, self.report)
 
@@ -104,14 +105,20 @@ class NodeBase[S: Settings](Answering):
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""
-        self._published[self.resolve_topic_name(topic.name)] = topic
+        name = self.resolve_topic_name(topic.name)
+        self._published[name] = topic
+
+        def end(publisher: Publisher) -> None:
+            self._published.pop(name, None)
+            self.destroy_publisher(publisher)
+
         # no default callbacks: one due when a publisher ends would end the process (rclpy 1644)
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return self.own(
             self.create_publisher(
                 topic.type, topic.name, topic.qos, event_callbacks=events
             ),
-            self.destroy_publisher,
+            end,
         )
 
     def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:

@@ -92,6 +92,8 @@ CORRECTED_MOTION = Topic(topics.CORRECTED_MOTION_TOPIC, JointState, _qos(1000))
 
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, _qos(100, reliable=False))
 """Of all nodes, of other packages too."""
+TOLD_TO_ALL = Topic(DIAGNOSTICS.name, DiagnosticArray, _qos(10))
+"""The same as a node publishes it."""
 
 # below the node's own name (~/)
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
