@@ -58,7 +58,8 @@ HARMONICS_UNTESTED = (
 )
 NODES_UNTESTED = (
     "the readings do not show whether the nodes of the map suffice, and the result will not be "
-    "qualified: read every mark twice (repeats: 2), or give the map fewer nodes"
+    "qualified: read every mark twice (repeats: 2), add marks or views, or give the map fewer "
+    "nodes"
 )
 NODES_ONLY = (
     "every reading lies at a node of the map: to test the error between nodes, add a view "

@@ -780,6 +780,25 @@ def test_a_plan_whose_harmonics_nothing_tests_says_so_before_it_is_measured(
         assert json.loads(capsys.readouterr().out)["harmonics_untested"] is is_said
 
 
+@pytest.mark.parametrize(("marks", "is_said"), [(4, True), (7, False)])
+def test_repeats_do_not_test_the_nodes_with_few_marks(tmp_path, capsys, marks, is_said):
+    data = {
+        "plan_id": "few",
+        "artifact": {"grid_size": marks, "grid_pitch": 0.01, "angular_count": 0},
+        "map": {"grid_size": 3, "interpolation": "bilinear"},
+        "views": [
+            {"name": "as_it_is", "repeats": 4},
+            {"name": "turned", "rotation_deg": 37, "repeats": 4},
+            {"name": "shifted", "translation_pitch": [0.5, 0.4], "repeats": 4},
+        ],
+    }
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump(data))
+    assert main(["plan", "check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert ("whether the nodes of the map suffice" in said) is is_said
+
+
 def test_a_plan_whose_nodes_nothing_tests_says_so_before_it_is_measured(
     tmp_path, capsys
 ):

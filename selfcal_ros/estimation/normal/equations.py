@@ -65,7 +65,9 @@ class NormalEquations:
     """
 
     nodes_untested = False
-    """Whether no finer map can test the nodes of the map: a lattice has none of its own."""
+    """Whether no other map can test the nodes of the map: a lattice has none of its own."""
+    dof_of_map = math.inf
+    """The degrees of freedom left to test them; only maps with their own nodes have to be."""
 
     def __init__(
         self,
@@ -589,16 +591,21 @@ class PlacedEquations(NormalEquations):
         grid = self.grid
         return 2 * (grid.n_sites - grid.vague * float(grid.variance_of_sites.sum()))
 
+    @property
+    def dof_of_map(self) -> float:  # type: ignore[override]
+        """The degrees of freedom that the map leaves to the residuals."""
+        return self.grid.equations_of_map - self.determined_coefficients
+
     @cached_property
     def nodes_untested(self) -> bool:  # type: ignore[override]
-        """Whether no finer map can test the nodes: it is too large, or has too few readings."""
+        """Whether no other map can test the nodes: it is too large, or has too few readings."""
         grid = self.grid
         spline = grid.views.spline
         if grid.too_large_to_refine:
             return True
         n_left = grid.equations_of_map
         if spline.axes[0].degree == 1:  # a smooth map of the same nodes tests them
-            return n_left - self.determined_coefficients < ENOUGH_DOF
+            return self.dof_of_map < ENOUGH_DOF
         if n_left > 2 * math.prod(spline.refined.shape):
             return False
         fine = PlacedSystem(

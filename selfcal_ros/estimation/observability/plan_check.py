@@ -18,6 +18,7 @@ from selfcal_ros.estimation.datum.covariance import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import (
+    ENOUGH_DOF,
     UNASKED_SITES,
     NormalEquations,
     planned_system,
@@ -138,7 +139,7 @@ class PlanCheck:
     harmonics_untested : bool
         Whether the views of lines are too few to show harmonics that the angular map lacks.
     nodes_untested : bool
-        Whether neither a finer map nor repeats show what the nodes of the map do not follow.
+        Whether neither another map nor repeats show what the nodes of the map do not follow.
     """
 
     observability: Observability
@@ -160,9 +161,14 @@ def check_plan(plan: Plan) -> PlanCheck:
         observability,
         unknown_sites=int((~system.known_sites).sum()),
         harmonics_untested=system.angular.harmonics_untested,
-        nodes_untested=all(view.repeats == 1 for view in plan.views if view.grid)
-        and system.nodes_untested,
+        nodes_untested=system.nodes_untested and not _repeats_test(system, plan),
     )
+
+
+def _repeats_test(system: NormalEquations, plan: Plan) -> bool:
+    """Return whether residuals, compared with repeats, test the nodes of the map."""
+    is_repeated = any(view.repeats > 1 for view in plan.views if view.grid)
+    return is_repeated and system.dof_of_map >= ENOUGH_DOF
 
 
 def with_unseen_modes(
