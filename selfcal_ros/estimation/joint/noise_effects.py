@@ -40,7 +40,7 @@ def axis_contrast(model: ModelFit) -> float:
             squares += (
                 visits.weight @ np.stack([residuals.real, residuals.imag], axis=1) ** 2
             )
-            dof += len(visits.mark) - len(np.unique(visits.mark))
+            dof += visits.n_repeats
     if 2 * dof < ENOUGH_DOF:
         residuals = model.fitted.residuals * model.problem.to_stage[:, None, None]
         weight = problem.system.grid.weight
@@ -81,9 +81,13 @@ def structured(
         added = contrast * added_variances(cover, along_x, rows)
     if slow_motion(model) is None and len(correlation := time_correlation(model)):
         correlated = correlated_variances(model, cover, correlation, rows)
-        # what it takes off is a share of either axis' noise, not of their mean
-        taken_off = np.minimum(correlated, 0.0) * added / _variances(cover, rows)
-        added = added + correlated + taken_off
+        # a share of either axis' noise, not of their mean; on the quieter axis at least that
+        of_axis = correlated * added / _variances(cover, rows)
+        added = (
+            added
+            + correlated
+            + np.where(correlated < 0, of_axis, np.maximum(of_axis, 0.0))
+        )
     return added + image_variances(model, cover, rows)
 
 

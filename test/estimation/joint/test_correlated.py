@@ -109,3 +109,26 @@ def test_what_correlation_takes_off_is_a_share_of_the_noise_of_each_axis(
         emap = solve_joint(readings, smooth).result.error_map
         maps.append(np.minimum(emap.u_gx, emap.u_gy))
     assert (maps[1] > 0.3 * maps[0]).all()
+
+
+def test_what_correlation_adds_is_a_share_of_the_noise_of_the_noisier_axis(monkeypatch):
+    """And at least that of the mean of both on the quieter one."""
+    _, readings = measured(5)
+    smooth = Options(assumed=(), causes=False, misalignment_model="linear")
+    monkeypatch.setattr(noise_effects, "axis_contrast", lambda model: 0.8)
+    monkeypatch.setattr(
+        noise_effects,
+        "correlated_variances",
+        lambda model, cover, correlation, rows: (
+            0.5 * noise_effects._variances(cover, rows)
+        ),
+    )
+    squares = []
+    for correlation in ([], [0.3]):
+        monkeypatch.setattr(
+            noise_effects, "time_correlation", lambda model, c=correlation: c
+        )
+        emap = solve_joint(readings, smooth).result.error_map
+        squares.append(np.stack([emap.u_gx, emap.u_gy]) ** 2)
+    ratio = squares[1] / squares[0]
+    assert ratio.min() == pytest.approx(1.5) and ratio.max() > 1.6
