@@ -200,7 +200,8 @@ class MotionOfStops:
         Of the means, over what white motion of the same size makes of each.
     shown, dof : float
         Variance of the exposures of one stop about its mean, and its degrees of freedom, over those
-        of white motion: 1 both if nothing is slow.
+        of white motion: 1 both if nothing is slow. No degrees of freedom if no stop was visited
+        again: what is slow does not show in exposures of one visit.
     """
 
     covariance: np.ndarray
@@ -231,7 +232,7 @@ class MotionOfStops:
             within += left.trace()
             squares += (left**2).sum()
         if not within > TRACE * len(covariance):  # no repeats
-            return cls(covariance, 1.0, 1.0)
+            return cls(covariance, 1.0, 0.0 if slow else 1.0)
         return cls(covariance, within / white, within**2 / (white * squares))
 
 

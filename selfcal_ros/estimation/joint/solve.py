@@ -594,8 +594,8 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | No
         if motion is None
         else SlowKept(
             noises.mark**2 / of_reading,
-            motion.white + noises.image**2 / of_reading,
-            motion.slow,
+            max(motion.white + noises.image**2 / of_reading, 0.0),
+            max(motion.slow, 0.0),
         ),
     )
 

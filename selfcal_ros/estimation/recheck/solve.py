@@ -83,7 +83,7 @@ from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.budget import BudgetLine, Details, OfNoise, OfPlate
-from selfcal_ros.model.error_map import ErrorMap, datum_modes, rms
+from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, datum_modes, rms
 from selfcal_ros.model.findings import (
     Changed,
     ChangedOrDrifted,
@@ -472,8 +472,6 @@ class StopsOfImages:
     ----------
     stop : int array (views, nx, ny)
         At which each mark was read; -1 = not read.
-    share : float
-        Part of the variance of a reading that the marks of an image have in common.
     mark, motion : float
         Variances of the noise of a mark, and of what the marks of an image share, m^2.
     of_stops : MotionOfStops
@@ -481,7 +479,6 @@ class StopsOfImages:
     """
 
     stop: np.ndarray
-    share: float
     mark: float
     motion: float
     of_stops: MotionOfStops
@@ -489,7 +486,9 @@ class StopsOfImages:
     def repeats(self, sigma: float, dof: float) -> tuple[float, float]:
         """Return the noise of a reading, m, and its dof, given those of repeats of marks."""
         hidden = max(sigma**2 - self.mark, 0.0) * (1 / self.of_stops.shown - 1)
-        shared = 1 + (marks_of_image(self.stop[self.stop >= 0]) - 1) * self.share
+        shown = self.of_stops.shown * self.motion
+        share = shown / (self.mark + shown) if shown else 0.0
+        shared = 1 + (marks_of_image(self.stop[self.stop >= 0]) - 1) * share
         return float(np.sqrt(sigma**2 + hidden)), dof * self.of_stops.dof / shared
 
 
@@ -509,9 +508,9 @@ def _images(
     total = motion.white + motion.slow
     stop = _stops(measurements, problem)
     slow = motion.slow / total if total else 0.0
+    of_reading *= _identical(problem.repeats_xy, problem.grid.weight)
     return StopsOfImages(
         stop,
-        share,
         motion.mark * of_reading,
         total * of_reading,
         MotionOfStops.of(problem.inputs, stop, slow),
@@ -744,6 +743,15 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     return terms
 
 
+def _identical(repeats: tuple[float, float], weight: np.ndarray) -> float:
+    """Return the weight of means of identical repeats, which average nothing; otherwise 1.
+
+    `repeats` is their scatter and its degrees of freedom.
+    """
+    sigma, dof = repeats
+    return float(weight.max()) if dof > 0 and not sigma > FLOOR else 1.0
+
+
 def _noise(
     images: StopsOfImages | None, problem: Problem, plate: KnownPlate
 ) -> tuple[NoiseEstimate, NoiseEstimate]:
@@ -768,15 +776,15 @@ def _noise(
     ):
         noise = noise_estimate(repeats, (nan, 0), nan)
         sigma, dof = getattr(before, f"sigma_{kind}"), getattr(before, f"dof_{kind}")
+        if kind == "theta" or images is None:
+            sigma *= np.sqrt(_identical(repeats, weight))
         many = noise.sigma > FLOOR and noise.dof >= ENOUGH_DOF
+        dofs = (min(noise.dof, MANY_DOF), min(dof, MANY_DOF))
         more = noise.sigma > sigma > FLOOR and (
-            fdtrc(noise.dof, dof, (noise.sigma / sigma) ** 2) < USUAL_LEVEL
+            fdtrc(*dofs, (noise.sigma / sigma) ** 2) < USUAL_LEVEL
         )
         if not (many or more):
-            # repeats that are identical average nothing
-            identical = noise.dof_repeats > 0 and not noise.repeats > FLOOR
-            of_one = np.sqrt(weight.max()) if identical else 1.0
-            noise = replace(noise, sigma=sigma * of_one, dof=dof)
+            noise = replace(noise, sigma=sigma, dof=dof)
         larger = max(noise.sigma, np.nan_to_num(declared))
         out.append(replace(noise, sigma=larger, declared=declared))
     return out[0], out[1]

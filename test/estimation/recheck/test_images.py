@@ -276,8 +276,11 @@ def test_a_plate_calibrated_with_one_mark_an_image_does_not_tell_its_noise():
         calibrate(after, Options(plate=alone, plate_from="r.json"))
 
 
-def slow_session(seed, repeats, *, change_m=0.0, times=1):
-    """Return a calibration and a recheck with slow motion, `times` as large in the latter."""
+def slow_session(seed, repeats, *, change_m=0.0, times=1, within_m=None):
+    """Return a calibration and a recheck with slow motion, `times` as large in the latter.
+
+    `within_m` is the scatter of its exposures within a visit.
+    """
     plan, rng = (
         image_plan(7, turns=(0, 90, 180), repeats=2),
         np.random.default_rng(seed),
@@ -297,6 +300,9 @@ def slow_session(seed, repeats, *, change_m=0.0, times=1):
     before = simulate_measurements(truth, plan, rng, settings=settings)
     settings = replace(settings, flicker_xy_m=times * settings.flicker_xy_m)
     after = simulate_measurements(later, again, rng, settings=settings)
+    if within_m is not None:
+        views = [replace(v, sigma_xy=within_m, dof_xy=60) for v in after.views]
+        after = replace(after, views=tuple(views))
     first = calibrate(before, Options(causes=False))
     return first, calibrate(after, Options(plate=first, plate_from="r.json"))
 
@@ -311,6 +317,30 @@ def test_slow_motion_is_no_change_of_the_stage(repeats, seeds):
         assert not result.recheck.changed
         sigma = np.hypot(MARK, 2 * MARK)
         assert result.noise.sigma_xy == pytest.approx(sigma, rel=0.3)
+
+
+def test_exposures_of_one_visit_do_not_show_how_large_slow_motion_is():
+    first, result = slow_session(4, 1, within_m=MARK)
+    assert not result.recheck.changed
+    assert result.noise.sigma_xy == pytest.approx(first.noise.sigma_xy, rel=0.1)
+
+
+def test_identical_exposures_average_nothing():
+    """Nor does the noise of the marks, by which it is tested whether the plate fits."""
+    _, before, after = sessions(2 * MARK, 3)
+    first = calibrate(before, Options(causes=False))
+    recheck_of = Options(plate=first, plate_from="r.json")
+    views = [
+        replace(view, count=4 * view.count, sigma_xy=0.0, dof_xy=3 * len(view.m))
+        for view in after.views
+    ]
+    once, again = (
+        calibrate(one, recheck_of)
+        for one in (after, replace(after, views=tuple(views)))
+    )
+    assert again.verdict.grade is once.verdict.grade
+    assert again.error_map.u_gx == pytest.approx(once.error_map.u_gx)
+    assert again.recheck.p == pytest.approx(once.recheck.p)
 
 
 def test_a_change_is_found_beside_slow_motion():
