@@ -216,7 +216,13 @@ def test_onto_combines_with_the_active_table(capsys):
         ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
         (
             "pmac R.json -o t.txt --counts-per-unit 1=2 --counts-per-unit 2=2",
-            "--counts-per-unit: every entry of the tables would be 0: they are in 31.2 µm",
+            "--counts-per-unit: every entry of motor 1 would be 0: it is in 31.2 µm, and the "
+            "corrections are at most ",
+        ),
+        (
+            "pmac R.json -o t.txt --counts-per-unit 1=2000 --counts-per-unit 2=2",
+            "--counts-per-unit: every entry of motor 2 would be 0: it is in 31.2 µm, and the "
+            "corrections are at most ",
         ),
         ("kmotion R.json -o R.json", "R.json: would be overwritten"),
         ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
@@ -300,6 +306,20 @@ def test_cal_export_combines_too(capsys):
     words = ["R.json", "-o", "n.cal", "--onto", "old.cal", "--y-axis", "3"]
     assert main(["cal", "export", *words]) == 2
     assert "it is for axes" in capsys.readouterr().err
+
+
+def test_errors_of_an_axis_below_half_an_entry_of_pmac_are_zeros():
+    """With 2000 counts in a mm an entry is 31 nm; y is good to 1 nm, and x has to be corrected."""
+    small = replace(MAP, gy=MAP.gy * 1e-9 / np.abs(MAP.gy).max())
+    write_json("R.json", result_to_dict(result_of(small)))
+    counts = "--counts-per-unit 1=2000 --counts-per-unit 2=2000"
+    assert run(f"pmac R.json -o t.txt {counts}") == 0
+    of_y, of_x = Path("t.txt").read_text().split("#2\n")[1].split("#1\n")
+    entries_of_y, entries_of_x = (
+        set(map(int, " ".join(re.findall("^[-0-9 ]+$", text, re.M)).split()))
+        for text in (of_y, of_x)
+    )
+    assert entries_of_y == {0} and len(entries_of_x) > 5
 
 
 @pytest.mark.parametrize("axes", [(1, 2), (2, 1)])

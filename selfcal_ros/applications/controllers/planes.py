@@ -141,24 +141,14 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     px, py = np.meshgrid(*at, indexing="ij")
     correct = wanted(error_map, wiring)
     tables = {}
-    corrections = correct(px, py)
+    motors = (frame.x_axis, frame.y_axis)
     changes = [
-        float(np.abs(PER_COUNT * per * (values - values[0, 0])).max())
-        for values, per in zip(corrections, counts, strict=True)
+        PER_COUNT * per * (values - values[0, 0])
+        for values, per in zip(correct(px, py), counts, strict=True)
     ]
-    if 0 < max(changes) < 0.5:
-        coarsest_m = frame.unit_m / (PER_COUNT * min(counts))
-        raise InputError(
-            "--counts-per-unit",
-            f"every entry of the tables would be 0: they are in {UM_PER_M * coarsest_m:.3g} µm",
-            f"give the counts per {frame.unit}",
-        )
-    for motor, values, per in zip(
-        (frame.x_axis, frame.y_axis), corrections, counts, strict=True
-    ):
-        integers = (
-            np.rint(PER_COUNT * per * (values - values[0, 0])).astype(int).T.ravel()[1:]
-        )
+    _require_entries(wiring, changes)
+    for motor, entries in zip(motors, changes, strict=True):
+        integers = np.rint(entries).astype(int).T.ravel()[1:]
         tables[motor] = [
             f"#{motor}",
             f"DEFINE COMP {shape[1]}.{shape[0]},#{frame.x_axis}D,#{frame.y_axis}D,"
@@ -170,6 +160,30 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
         ]
     high_first = sorted(tables, reverse=True)
     return {"": [line for motor in high_first for line in tables[motor]] + ["I51=1"]}
+
+
+def _require_entries(wiring: Wiring, changes: Sequence[np.ndarray]) -> None:
+    """Raise InputError if the counts of a motor make all of its entries 0.
+
+    They are in question if no motor has another entry, or if this one had with the counts of the
+    other motor; else its errors are that small.
+    """
+    frame, counts = wiring.frame, _counts(wiring)
+    largest = [float(np.abs(entries).max()) for entries in changes]
+    for motor, change, per in zip(
+        (frame.x_axis, frame.y_axis), largest, counts, strict=True
+    ):
+        if 0 < change <= 0.5 and (
+            max(largest) <= 0.5 or change * max(counts) / per > 0.5
+        ):
+            entry_um = UM_PER_M * frame.unit_m / (PER_COUNT * per)
+            raise InputError(
+                "--counts-per-unit",
+                f"every entry of motor {motor} would be 0: it is in {entry_um:.3g} µm, and the "
+                f"corrections are at most {change * entry_um:.3g} µm",
+                f"give the counts per {frame.unit}; if these are right, the errors are too small "
+                "for a table",
+            )
 
 
 def _counts(wiring: Wiring) -> tuple[float, float]:
