@@ -14,6 +14,7 @@ from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.settings.estimator import solver_options
@@ -120,17 +121,22 @@ def _read(args: argparse.Namespace) -> tuple[StageMap, Measurements | None]:
             "the plates differ",
             "name the result of this bag",
         )
-    elif (
-        stage.result.run_id != measurements.run_id
-        and "sha256" in stage.result.input
-        and stage.result.input["sha256"] != bag_input(args.source)["sha256"]
-    ):
+    elif not _is_of(stage.result, args.source, measurements.run_id):
         raise InputError(
             f"{args.source} and {args.result}",
             "the result is of another recording",
             "name the result of this bag",
         )
     return stage, measurements
+
+
+def _is_of(result: CalibrationResult, bag: str, run_id: str) -> bool:
+    """Return whether a result is of a bag, as far as its run or its digest tells."""
+    if result.run_id and result.run_id == run_id:
+        return True
+    if digest := result.input.get("sha256"):
+        return digest == bag_input(bag)["sha256"]
+    return not (result.run_id and run_id)
 
 
 def _figures(evaluated: AxisFigures | PathFigures) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from selfcal_ros.applications.standards.iso230 import (
     scatters,
 )
 from selfcal_ros.apply import StageMap
+from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.cli import iso230 as verb
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -28,10 +30,13 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.simulation.cell import CellSettings
+from test.support.bags import Foreign
 from test.support.maps import random_map, result_of
 from test.support.options import bare
 from test.support.pages import ROOT
+from test.support.sessions import events_of, small_plan
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01)
@@ -514,3 +519,39 @@ def test_what_scatters_far_beyond_its_noise_is_true():
     assert centre.std() == pytest.approx(1 / np.sqrt(40), rel=0.3)
     _, share = _true_shares(5.0 + rng.normal(0, 0.1, 40), u, rng)
     assert not share.any()
+
+
+@pytest.mark.parametrize(
+    ("run_id", "digest", "code"),
+    [
+        ("", "of another", 2),
+        ("", None, 0),
+        ("run of another", None, 0),
+        ("", "own", 0),
+        ("run of another", "own", 0),
+    ],
+)
+def test_a_bag_whose_commands_name_no_run(
+    tmp_path, monkeypatch, capsys, run_id, digest, code
+):
+    """Two recordings of no run were taken for one: "" is "" in both."""
+    bag, path = tmp_path / "a.mcap", str(tmp_path / "r.json")
+    Foreign().write(bag, events_of(small_plan()))
+    measurements = replace(collect_bag(bag, CollectorSettings())[0], run_id="")
+    monkeypatch.setattr(verb, "collect_bag", lambda *_: (measurements,))
+    result = calibrate(measurements)
+    digests = {"own": bag_input(bag)["sha256"], "of another": 64 * "0"}
+    source = {} if digest is None else {"sha256": digests[digest]}
+    result = replace(worded(result), run_id=run_id, input=source)
+    write_json(path, result_to_dict(result))
+    assert main(["iso230", str(bag), "--result", path, "--json"]) == code
+    assert ("of another recording" in capsys.readouterr().err) == (code == 2)
+
+
+def test_another_run_without_a_digest_is_another_recording(tmp_path, capsys):
+    bag, path = str(ROOT / "bags/hu_noise"), str(tmp_path / "r.json")
+    measurements = collect_bag(bag, CollectorSettings())[0]
+    result = worded(calibrate(measurements))
+    for run_id, code in ((measurements.run_id, 0), ("", 0), ("another", 2)):
+        write_json(path, result_to_dict(replace(result, run_id=run_id, input={})))
+        assert main(["iso230", bag, "--result", path, "--json"]) == code
