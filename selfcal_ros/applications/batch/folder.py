@@ -180,7 +180,7 @@ def opened(folder: Path) -> Iterator[None]:
         If it cannot be created, another batch is using it, or a file in it that would be replaced
         is not that of a batch.
     """
-    if not (folder / LOCK).exists():
+    if not _is_of_batch(folder):
         for name in WRITTEN:
             if has_content(folder / name):
                 raise InputError(
@@ -204,6 +204,17 @@ def opened(folder: Path) -> Iterator[None]:
         for part in (folder / RECORDS, folder / RESULTS):
             sweep(part)
         yield
+
+
+def _is_of_batch(folder: Path) -> bool:
+    """Return whether a folder has the records or the data of a batch."""
+    if (folder / RECORDS).is_dir():
+        return True
+    try:
+        data = read_json(folder / DATA)
+    except InputError:
+        return False
+    return isinstance(data, dict) and data.get("schema") == SCHEMA
 
 
 def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:

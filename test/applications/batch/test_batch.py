@@ -68,12 +68,13 @@ def stamps(folder: Path) -> dict[str, int]:
 @pytest.mark.parametrize("name", ["table.csv", "index.html", "batch.json"])
 def test_files_that_are_not_of_a_batch_are_not_replaced(shelf, tmp_path, capsys, name):
     (tmp_path / name).write_text("mine")
+    (tmp_path / ".lock").touch()  # of another program
     assert batch(shelf / "a.mcap", "-o", tmp_path, "--workers", 1) == 2
     assert capsys.readouterr().err == (
         f"selfcal batch: {tmp_path / name}: the file exists, and is not that of a batch; "
         "name another folder\n"
     )
-    assert {path.name for path in tmp_path.iterdir()} == {name}
+    assert {path.name for path in tmp_path.iterdir()} == {name, ".lock"}
     assert (tmp_path / name).read_text() == "mine"
 
 
@@ -179,6 +180,11 @@ def test_a_copy_of_a_bag_counts_once_over_time(shelf, tmp_path):
     again = tmp_path / "again.mcap", shelf / "a.mcap", "-o", tmp_path / "out"
     assert batch(*again) == 0
     assert content(tmp_path / "out")["done_before"] == 2
+    (tmp_path / "out/.lock").unlink()  # copied without files that begin with a dot
+    assert batch(*again) == 0
+    assert content(tmp_path / "out")["done_before"] == 2
+    shutil.rmtree(tmp_path / "out" / RECORDS)
+    assert batch(*again) == 0
 
 
 def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(
