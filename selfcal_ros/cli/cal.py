@@ -33,12 +33,12 @@ from selfcal_ros.applications.aerotech.verify import (
     verify_tables,
 )
 from selfcal_ros.applications.aerotech.write import cal_text
-from selfcal_ros.applications.controllers.export import place_to_look
+from selfcal_ros.applications.controllers.export import WRITTEN_SO, place_to_look
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
 from selfcal_ros.compensation.export import fill_unknown, provenance
-from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
+from selfcal_ros.compensation.frame import MARK, MachineFrame, frame_from_comments
 from selfcal_ros.compensation.plausible import require_plausible
 from selfcal_ros.compensation.residual import (
     Correction,
@@ -444,21 +444,21 @@ def require_same_axes(
 
     Zero may do so: the stage frame is that of the field, and two calibrations may have two.
     """
-    stated = frame_from_comments(comments)
+    stated = frame_from_comments(comments, frame)
     if stated is None:
         return
+    said = next(line for line in comments if line.startswith(MARK))
     if not stated.same_axes(frame):
         raise InputError(
             where,
-            f"it says '{stated.comment()}', and the options '{frame.comment()}'",
-            "give the options with which it was written",
+            f"it says '{said}', and the options '{frame.comment()}'",
+            WRITTEN_SO,
         )
     if (stated.home_x_m, stated.home_y_m) != (frame.home_x_m, frame.home_y_m):
         warn(
             args,
-            f"--onto: {where} says '{stated.comment()}', and the options "
-            f"'{frame.comment()}': right only if the fields of both calibrations lie "
-            "apart by the difference",
+            f"--onto: {where} says '{said}', and the options '{frame.comment()}': right only if "
+            "the fields of both calibrations are offset by this difference",
         )
 
 

@@ -431,7 +431,7 @@ def _deliver(
             if result is None
             else [*origin_lines(result, command(args)), *verdict_lines(result)]
         ),
-        frame.comment(),
+        frame.comment(axes_alone=result is None),
     ]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)

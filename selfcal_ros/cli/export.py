@@ -84,8 +84,9 @@ def run(args: argparse.Namespace) -> int:
     active = None
     if args.onto:
         sources = [Source(read_text(path), path) for path in args.onto]
-        comments = [line for source in sources for line in comments_of(source.text)]
-        require_same_axes(args, sources[0].where, comments, wiring.frame)
+        for source in sources:
+            comments = comments_of(source.text)
+            require_same_axes(args, source.where, comments, wiring.frame)
         require_written_so(args.format, sources, wiring)
         active = loaded(args.format, sources, wiring)
     exported = export(

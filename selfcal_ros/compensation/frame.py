@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,9 @@ UNITS_M = {name: M_PER[name] for name in ("m", "mm", "um")}
 """Primary units of linear axes; the primary unit of a rotary axis is the degree."""
 LENGTHS_M = {**UNITS_M, "in": M_PER_INCH}
 """Units of lengths of all controllers."""
-_MARK = "machine: "
+MARK = "machine: "
+"""Begins the comment of a calibration file that states its frame."""
+_AXES = ("x_axis", "y_axis", "unit")
 
 
 @dataclass(frozen=True)
@@ -127,15 +130,23 @@ class MachineFrame:
         """Return whether x and y have the same indices, unit and directions in another frame."""
         return all(
             getattr(self, name) == getattr(other, name)
-            for name in ("x_axis", "y_axis", "unit", "reverse_x", "reverse_y")
+            for name in (*_AXES, "reverse_x", "reverse_y")
         )
 
-    def comment(self) -> str:
-        """Return the frame as a comment of a calibration file."""
+    def comment(self, *, axes_alone: bool = False) -> str:
+        """Return the frame as a comment of a calibration file.
+
+        With `axes_alone` it states axes and unit: what was measured at positions of the controller
+        tells no home position and no direction.
+        """
         words = [
             f"x-axis={self.x_axis}",
             f"y-axis={self.y_axis}",
             f"unit={self.unit}",
+        ]
+        if axes_alone:
+            return MARK + " ".join(words)
+        words += [
             f"home-x={self.home_x_m / self.unit_m:.15g}",
             f"home-y={self.home_y_m / self.unit_m:.15g}",
         ]
@@ -151,34 +162,51 @@ class MachineFrame:
             ]
         if self.theta_counts_per_unit is not None:
             words.append(f"theta-counts-per-unit={self.theta_counts_per_unit:.17g}")
-        return _MARK + " ".join(words)
+        return MARK + " ".join(words)
 
 
-def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
+def frame_from_comments(
+    comments: Sequence[str], unstated: MachineFrame | None = None
+) -> MachineFrame | None:
     """Return the frame that `MachineFrame.comment` wrote into a file, or several, or None.
+
+    Home positions and directions are those of `unstated` if axes and unit alone are stated.
 
     Raises
     ------
     InputError
-        If they state different frames; one may be without theta.
+        If they state different frames; one may be without theta, or of axes and unit alone.
     """
     stated = [
-        frame
+        (frame, "home-x=" in line)
         for line in comments
-        if line.startswith(_MARK) and (frame := _stated(line))
+        if line.startswith(MARK) and (frame := _stated(line))
     ]
-    full_frame = max(
-        stated, key=lambda frame: frame.theta_axis is not None, default=None
+    if not stated:
+        return None
+    full_frame, placed = max(
+        stated, key=lambda pair: (pair[1], pair[0].theta_axis is not None)
     )
-    for frame in stated:
-        if full_frame is not None and frame not in (full_frame, _plane(full_frame)):
+    for frame, whole in stated:
+        same = (
+            frame in (full_frame, _plane(full_frame))
+            if whole
+            else _axes(frame) == _axes(full_frame)
+        )
+        if not same:
             raise InputError(
                 "comments",
-                f"the tables are for different axes, '{frame.comment()}' and "
-                f"'{full_frame.comment()}'",
+                f"the tables are for different axes, '{frame.comment(axes_alone=not whole)}' and "
+                f"'{full_frame.comment(axes_alone=not placed)}'",
                 "write them with the same options",
             )
-    return full_frame
+    if unstated is None or placed:
+        return full_frame
+    return replace(_plane(unstated), **_axes(full_frame))
+
+
+def _axes(frame: MachineFrame) -> dict[str, Any]:
+    return {name: getattr(frame, name) for name in _AXES}
 
 
 def _plane(frame: MachineFrame) -> MachineFrame:
@@ -193,7 +221,7 @@ def _plane(frame: MachineFrame) -> MachineFrame:
 
 
 def _stated(line: str) -> MachineFrame | None:
-    words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK) :]))
+    words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(MARK) :]))
     try:
         unit_m = LENGTHS_M[words.get("unit", "mm")]
         theta = words.get("theta-axis")

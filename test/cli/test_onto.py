@@ -289,7 +289,85 @@ def test_files_of_x_and_y_are_not_exchanged(tmp_path, monkeypatch, capsys):
     words = ["export", "linuxcnc", "R.json", "-o"]
     assert main([*words, "old.txt"]) == 0
     assert main([*words, "new.txt", "--onto", "old_y.txt", "old_x.txt"]) == 2
-    assert "old_y.txt: it says 'this table: the file of y'" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "old_y.txt: it says 'this table: the file of y'" in err
+    assert "; name the file of x first\n" in err
+    text = Path("old_y.txt").read_text()
+    Path("old_y.txt").write_text(text.replace("x-axis=1", "x-axis=3"))
+    assert main([*words, "new.txt", "--onto", "old_x.txt", "old_y.txt"]) == 2
+    assert "old_y.txt: it says 'machine: x-axis=3" in capsys.readouterr().err
+
+
+def test_a_table_that_was_written_in_the_wrong_sense_is_replaced(
+    tmp_path, monkeypatch, capsys
+):
+    """The controller subtracts it: it is used with --negate once its comment is gone."""
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(sayable("siemens", G))))
+    words = ["export", "siemens", "R.json", "-o"]
+    assert main([*words, "old.txt"]) == 0
+    text = Path("old.txt").read_text()
+    Path("old.txt").write_text(text.replace("table: added", "table: added  \r"))
+    assert main([*words, "same.txt", "--onto", "old.txt"]) == 0
+    capsys.readouterr()
+    negated = [*words, "new.txt", "--negate", "--onto", "old.txt"]
+    assert main(negated) == 2
+    assert capsys.readouterr().err == (
+        "selfcal export: old.txt: it says 'this table: added', and is taken for 'this table: "
+        "subtracted'; give the options with which it was written; if the controller uses it "
+        "otherwise, delete this comment first\n"
+    )
+    kept = [line for line in text.splitlines() if "this table: " not in line]
+    Path("old.txt").write_text("\n".join(kept) + "\n")
+    assert main(negated) == 0
+
+
+@pytest.mark.parametrize(
+    ("verb", "counts"), [("pmac", "1=2000 2=2000"), ("linuxcnc", ""), ("siemens", "")]
+)
+def test_no_file_is_taken_for_nothing(tmp_path, monkeypatch, capsys, verb, counts):
+    """KMotion's file states no part, counts or sense, and PMAC's none without counts."""
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(sayable(verb, G))))
+    words = [
+        *["R.json", "-o", "old.txt"],
+        *[word for count in counts.split() for word in ("--counts-per-unit", count)],
+    ]
+    assert main(["export", verb, *words]) == 0
+    old = str(min(Path().glob("old*.txt")))
+    capsys.readouterr()
+    for other in ("pmac", "kmotion"):
+        line = ["export", other, "R.json", "-o", "new.txt", "--unit", "mm"]
+        assert main([*line, "--onto", old]) == 2
+        assert "taken for" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options", ["--reverse-x", "--home-x 3", "--reverse-y --home-y 2"]
+)
+def test_a_table_of_measured_errors_states_neither_directions_nor_home(
+    tmp_path, monkeypatch, capsys, options
+):
+    """Its positions are the controller's: each export from a result may replace it."""
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(G)))
+    rows = "".join(f"{p},{(p / 10) ** 2}\n" for p in range(-40, 41, 10))
+    Path("d.csv").write_text("position,error\n" + rows)
+    square = "orthogonality --measured 5um --over 200mm --travel 300mm --home end"
+    for number, words in enumerate(("accuracy d.csv", "straightness d.csv", square)):
+        old, new = f"old{number}.cal", f"new{number}.cal"
+        assert main(["cal", *words.split(), "-o", old]) == 0
+        text = Path(old).read_text()
+        assert re.findall("machine: .*", text) == ["machine: x-axis=1 y-axis=2 unit=mm"]
+        export = ["cal", "export", "R.json", "--onto", old, *options.split()]
+        capsys.readouterr()
+        assert main([*export, "-o", new]) == 0
+        assert "says" not in capsys.readouterr().err
+        assert main([*export, "-o", "other.cal", "--unit", "um"]) == 2
+        assert (
+            f"{old}: it says 'machine: x-axis=1 y-axis=2 unit=mm', and the options"
+            in capsys.readouterr().err
+        )
 
 
 @pytest.mark.parametrize("verb", ["export kmotion", "cal export"])
@@ -304,4 +382,4 @@ def test_another_zero_than_that_of_the_active_table_is_said(
     capsys.readouterr()
     assert main([*words, "new.txt", "--onto", "old.txt"]) == 0
     err = capsys.readouterr().err
-    assert "old.txt says 'machine: " in err and "right only if the fields" in err
+    assert "old.txt says 'machine: " in err and "are offset by this difference" in err

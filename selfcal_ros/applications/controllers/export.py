@@ -50,6 +50,11 @@ NEGATED = (
 )
 HOW = "this table: "
 """Begins the comment that says of a file what the frame of the machine does not."""
+WRITTEN_SO = (
+    "give the options with which it was written; if the controller uses it otherwise, delete this "
+    "comment first"
+)
+"""How an active table is used whose comment is not that of the options."""
 
 
 @dataclass(frozen=True)
@@ -302,7 +307,7 @@ def _how(form: Format, wiring: Wiring, part: str) -> list[str]:
 
 def comments_of(text: str) -> list[str]:
     """Return the lines of a table without what begins a comment."""
-    return [line.lstrip("#; ") for line in text.splitlines()]
+    return [line.lstrip("#; ").rstrip() for line in text.splitlines()]
 
 
 def _plain(text: str) -> str:
@@ -395,11 +400,12 @@ def require_written_so(name: str, sources: Sequence[Source], wiring: Wiring) -> 
     """Raise InputError if a file says that it is another one, of other counts or sense."""
     form = FORMATS[name]
     for part, source in zip(form.parts, sources, strict=False):
-        own = _how(form, wiring, part)
-        for line in comments_of(source.text):
-            if line.startswith(HOW) and [line] != own:
-                raise InputError(
-                    source.where,
-                    f"it says '{line}', and is taken for '{''.join(own)}'",
-                    "give the options with which it was written, of two files x first",
-                )
+        for own in _how(form, wiring, part):
+            for line in comments_of(source.text):
+                if line.startswith(HOW) and line != own:
+                    exchanged = part and not line.startswith(f"{HOW}the file of {part}")
+                    raise InputError(
+                        source.where,
+                        f"it says '{line}', and is taken for '{own}'",
+                        "name the file of x first" if exchanged else WRITTEN_SO,
+                    )

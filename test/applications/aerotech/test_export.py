@@ -303,6 +303,16 @@ def test_frames_survive_their_comment(frame):
     )
 
 
+def test_axes_alone_go_with_every_frame_of_these_axes():
+    frame = MachineFrame(1, 2, 3, home_x_m=0.01, reverse_y=True)
+    lines = [MachineFrame().comment(axes_alone=True), frame.comment()]
+    assert frame_from_comments(lines) == frame_from_comments(lines[::-1]) == frame
+    assert frame_from_comments(lines[:1]) == MachineFrame()
+    assert frame_from_comments(lines[:1], MachineFrame(reverse_x=True)).reverse_x
+    with pytest.raises(InputError, match="'machine: x-axis=4 y-axis=2 unit=mm' and"):
+        frame_from_comments([MachineFrame(4).comment(axes_alone=True), frame.comment()])
+
+
 @pytest.mark.parametrize(
     "comments",
     [
