@@ -159,8 +159,8 @@ def add_frame(
         group.add_argument(
             "--steep",
             action="store_true",
-            help="accept a map that changes by more "
-            "than 1 %% of the distance between neighbouring nodes",
+            help="accept errors that change by more "
+            "than 1 %% of the distance between neighbouring positions",
         )
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
@@ -389,8 +389,6 @@ def _line(args: argparse.Namespace) -> int:
         line = cal_lines.measured_line(
             read_text(args.source), args.source, frame.unit_m
         )
-        if not args.steep:
-            require_plausible_line(line.positions_m, line.corrections_m, args.source)
     else:
         result = read_result(args.source)
         if not args.steep:
@@ -398,6 +396,8 @@ def _line(args: argparse.Namespace) -> int:
         line = cal_lines.map_line(result.error_map, args.along, corrected)
     if corrected != args.along:
         line = cal_lines.without_slope(line)
+    if result is None and not args.steep:
+        require_plausible_line(line.positions_m, line.corrections_m, args.source)
     return _deliver(args, line, frame, (args.along, corrected), result)
 
 

@@ -142,9 +142,7 @@ def _empty(name: str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(
-            name,
-            "has files, which pictures could replace",
-            "remove it or name another folder",
+            name, "has files, which pictures could replace", "name another folder"
         )
     return folder
 

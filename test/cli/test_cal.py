@@ -512,10 +512,12 @@ def test_a_table_of_a_map_without_uncertainty_says_so(run):
 def test_measured_errors_in_another_unit_are_asked_about(run, tmp_path):
     """An error of 0.4 um over 10 mm given in nm, and a square with its units exchanged."""
     (tmp_path / "nm.csv").write_text("position,error\n0,0\n10,400\n20,100\n")
-    for verb in ("accuracy", "straightness"):
+    for verb, step in (("accuracy", 400), ("straightness", 350)):
         code, _, err = run(verb, "nm.csv", "-o", "x.cal")
         assert code == 2
-        one_line(err, "nm.csv: the error changes by 400 µm within 10 mm: is it real?")
+        one_line(
+            err, f"nm.csv: the error changes by {step} µm within 10 mm: is it real?"
+        )
         assert not (tmp_path / "x.cal").exists()
     assert run("accuracy", "nm.csv", "--steep", "-o", "x.cal")[0] == 0
     square = ["--measured", "5mm", "--over", "200um", "--travel", "900mm"]
@@ -524,6 +526,13 @@ def test_measured_errors_in_another_unit_are_asked_about(run, tmp_path):
         assert code == 2
         one_line(err, "--measured: the error changes by 5000 µm within 0.2 mm")
     assert run("orthogonality", *square, "--steep")[0] == 0
+
+
+def test_a_straightedge_may_be_tilted(run, tmp_path):
+    """By 2 %, from which it departs by 1 um: the slope is taken off."""
+    (tmp_path / "t.csv").write_text("position,error\n0,0\n10,201\n20,400\n30,600\n")
+    assert run("straightness", "t.csv", "-o", "x.cal")[0] == 0
+    assert run("accuracy", "t.csv", "-o", "y.cal")[0] == 2
 
 
 def test_check_gi4(run, tmp_path):

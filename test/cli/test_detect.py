@@ -667,7 +667,10 @@ def test_images_are_drawn_with_what_was_found_and_what_was_rejected(
     assert len(pictures) == 20
     before = pictures[0].read_bytes()
     assert detect(bag, tmp_path / "again", "--draw", str(tmp_path / "drawn")) == 2
-    assert "drawn: has files, which pictures could replace" in capsys.readouterr().err
+    assert (
+        "drawn: has files, which pictures could replace; name another folder\n"
+        in capsys.readouterr().err
+    )
     assert pictures[0].read_bytes() == before and not (tmp_path / "again").exists()
     colours = []
     for picture in pictures[:2]:
