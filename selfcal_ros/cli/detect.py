@@ -2,6 +2,7 @@
 """``selfcal detect``: marks in the images of a bag, written as detections."""
 
 import argparse
+import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -88,15 +89,12 @@ def run(args: argparse.Namespace) -> int:
     )
     draw = partial(_drawn, _empty(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or TYPED, draw)
-    if args.positions:
-        problems = _from_files(args, detector, settings.frame_id)
-    else:
-        problems = ImageBag(Path(args.bag), args.namespace).write_detected(
-            args.output,
-            detector.take,
-            check=partial(detector.refuse_nothing, args.bag),
-            frame_id=settings.frame_id,
-        )
+    try:
+        problems = _written(args, detector, settings.frame_id)
+    finally:
+        if args.draw:
+            with contextlib.suppress(OSError):  # it has pictures
+                Path(args.draw).rmdir()
     truth = Path(args.bag, TRUTH_FILE)
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
@@ -109,6 +107,20 @@ def run(args: argparse.Namespace) -> int:
         {"bag": args.output, "counts": counts, "problems": dict(problems)},
     )
     return 0
+
+
+def _written(
+    args: argparse.Namespace, detector: "ImageDetector", frame: str
+) -> "Counter[str]":
+    """Write a bag from images; return problems."""
+    if args.positions:
+        return _from_files(args, detector, frame)
+    return ImageBag(Path(args.bag), args.namespace).write_detected(
+        args.output,
+        detector.take,
+        check=partial(detector.refuse_nothing, args.bag),
+        frame_id=frame,
+    )
 
 
 def _from_files(

@@ -671,6 +671,9 @@ def test_images_are_drawn_with_what_was_found_and_what_was_rejected(
         "drawn: has files, which pictures could replace; name another folder\n"
         in capsys.readouterr().err
     )
+    left_out = tmp_path / "not_drawn"
+    assert detect(tmp_path / "no", tmp_path / "x", "--draw", str(left_out)) == 2
+    assert not left_out.exists()
     assert pictures[0].read_bytes() == before and not (tmp_path / "again").exists()
     colours = []
     for picture in pictures[:2]:
