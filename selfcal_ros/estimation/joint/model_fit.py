@@ -155,7 +155,7 @@ def equations_of(
 ) -> TermEquations:
     """Return the equations of columns about the estimate `fitted`."""
     noise = fitted.xy
-    # identical repeats show a sensor's resolution: no offset would be noise
+    # identical repeats show a sensor's resolution; then no offset would count as noise
     shown = [
         sigma
         for sigma in (noise.declared, noise.repeats, noise.residuals)
