@@ -2,7 +2,6 @@
 """``selfcal detect``: marks in the images of a bag, written as detections."""
 
 import argparse
-import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -89,12 +88,15 @@ def run(args: argparse.Namespace) -> int:
     )
     draw = partial(_drawn, _empty(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or TYPED, draw)
-    try:
-        problems = _written(args, detector, settings.frame_id)
-    finally:
-        if args.draw:
-            with contextlib.suppress(OSError):  # it has pictures
-                Path(args.draw).rmdir()
+    if args.positions:
+        problems = _from_files(args, detector, settings.frame_id)
+    else:
+        problems = ImageBag(Path(args.bag), args.namespace).write_detected(
+            args.output,
+            detector.take,
+            check=partial(detector.refuse_nothing, args.bag),
+            frame_id=settings.frame_id,
+        )
     truth = Path(args.bag, TRUTH_FILE)
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
@@ -107,20 +109,6 @@ def run(args: argparse.Namespace) -> int:
         {"bag": args.output, "counts": counts, "problems": dict(problems)},
     )
     return 0
-
-
-def _written(
-    args: argparse.Namespace, detector: "ImageDetector", frame: str
-) -> "Counter[str]":
-    """Write a bag from images; return problems."""
-    if args.positions:
-        return _from_files(args, detector, frame)
-    return ImageBag(Path(args.bag), args.namespace).write_detected(
-        args.output,
-        detector.take,
-        check=partial(detector.refuse_nothing, args.bag),
-        frame_id=frame,
-    )
 
 
 def _from_files(
@@ -142,7 +130,7 @@ def _from_files(
 
 
 def _empty(name: str) -> Path:
-    """Return a folder for pictures, created if it is not there.
+    """Return a folder for pictures.
 
     Raises
     ------
@@ -150,9 +138,7 @@ def _empty(name: str) -> Path:
         If it has files: those of the camera may have the same names.
     """
     folder = Path(name)
-    with creating(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    if any(folder.iterdir()):
+    if folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             name, "has files, which pictures could replace", "name another folder"
         )
@@ -168,6 +154,8 @@ def _drawn(
 ) -> None:
     """Write an image with what was found and what was rejected in it."""
     size = settings.mark_size / settings.pixel_size
+    with creating(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     write_bytes(
         folder / f"{Path(name).stem}.png",
         circled(picture.values, judged, size),

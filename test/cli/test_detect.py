@@ -674,6 +674,9 @@ def test_images_are_drawn_with_what_was_found_and_what_was_rejected(
     left_out = tmp_path / "not_drawn"
     assert detect(tmp_path / "no", tmp_path / "x", "--draw", str(left_out)) == 2
     assert not left_out.exists()
+    left_out.mkdir()
+    assert detect(tmp_path / "no", tmp_path / "x", "--draw", str(left_out)) == 2
+    assert left_out.is_dir()  # whoever made it keeps it
     assert pictures[0].read_bytes() == before and not (tmp_path / "again").exists()
     colours = []
     for picture in pictures[:2]:
