@@ -67,7 +67,8 @@ class NodeBase[S: Settings](Answering):
         self.alone_on: list[str] = []
         self._subscribed: dict[str, Topic] = {}
         self._published: dict[str, Topic] = {}
-        self._unmatched: set[str] = set()  # endpoints without messages, as logged
+        # what was logged of other nodes' endpoints without messages
+        self._unmatched: set[str] = set()
         try:
             self._take_parameters(kind)
             self.set_descriptor(

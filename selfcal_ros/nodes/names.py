@@ -134,43 +134,45 @@ COMMANDED = (MOTION, CORRECTED_MOTION)
 
 def unheard(node: Node, subscribed: Mapping[str, Topic]) -> Diagnosis:
     """Name the publishers whose type or quality of service keeps their messages from this node."""
-    faults = []
-    for name, topic in subscribed.items():
-        for other in node.get_publishers_info_by_topic(name):
-            who = f"{topic.name}: no messages are received from {_name(other)}"
-            if other.topic_type != topic.type_name:
-                faults.append(
-                    f"{who} (it publishes {other.topic_type}); publish {topic.type_name}, "
-                    "or remap its topic"
-                )
-            elif why := _incompatible(offer=other.qos_profile, request=topic.qos):
-                faults.append(f"{who} ({why}); offer the QoS in docs/reference/ros2.md")
+    faults = [
+        f"{topic.name}: no messages are received from {_name(other)} {why}"
+        for name, topic in subscribed.items()
+        for other in node.get_publishers_info_by_topic(name)
+        if (why := _mismatch(topic, other, publishes=True))
+    ]
     return Diagnosis(Level.ERROR if faults else Level.OK, "; ".join(faults))
 
 
 def unreached(node: Node, published: Mapping[str, Topic]) -> Diagnosis:
     """Name the subscribers that this node's messages do not reach, by type or by QoS."""
-    faults = []
-    for name, topic in published.items():
-        for other in node.get_subscriptions_info_by_topic(name):
-            who = f"{topic.name}: no messages reach {_name(other)}"
-            if other.topic_type != topic.type_name:
-                faults.append(
-                    f"{who} (it subscribes to {other.topic_type}); subscribe to "
-                    f"{topic.type_name}, or remap its topic"
-                )
-            elif why := _incompatible(offer=topic.qos, request=other.qos_profile):
-                faults.append(
-                    f"{who} ({why}); subscribe with the QoS in docs/reference/ros2.md"
-                )
+    faults = [
+        f"{topic.name}: no messages reach {_name(other)} {why}"
+        for name, topic in published.items()
+        for other in node.get_subscriptions_info_by_topic(name)
+        if (why := _mismatch(topic, other, publishes=False))
+    ]
     return Diagnosis(Level.WARN if faults else Level.OK, "; ".join(faults))
 
 
-def _incompatible(*, offer: QoSProfile, request: QoSProfile) -> str:
+def _mismatch(topic: Topic, other: Any, *, publishes: bool) -> str:
+    """Return why an endpoint of another node does not match, and the remedy; "" if it does.
+
+    `publishes` is whether the other node publishes on `topic`, or subscribes to it.
+    """
+    if other.topic_type != topic.type_name:
+        does, do = (
+            ("publishes", "publish") if publishes else ("subscribes to", "subscribe to")
+        )
+        return f"(it {does} {other.topic_type}); {do} {topic.type_name}, or remap its topic"
+    offer, request = (
+        (other.qos_profile, topic.qos) if publishes else (topic.qos, other.qos_profile)
+    )
     verdict, reason = qos_check_compatible(offer, request)
     if verdict != QoSCompatibility.ERROR:
         return ""
-    return reason.replace("ERROR: ", " ").strip(";. ")
+    why = reason.replace("ERROR: ", " ").strip(";. ")
+    how = "offer" if publishes else "subscribe with"
+    return f"({why}); {how} the QoS in docs/reference/ros2.md"
 
 
 def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
