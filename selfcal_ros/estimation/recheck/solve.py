@@ -534,7 +534,7 @@ def _readings(
     """
     _require_noise(sigma)
     variance = sigma**2
-    stop = _stops(measurements, problem)
+    stop = _stops(measurements, problem) if images is None else images.stop
     if images is not None:
         variance = float(np.clip(images.mark, TRACE * sigma**2, sigma**2))
     read = problem.system.grid.read
