@@ -117,8 +117,8 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     dof = system.grid.equations_of_map - fine.determined_coefficients
     if dof < 1 and not _is_bilinear(coarse):
         return None
-    finer = _against_finer(model, refined)
-    smoother = _against_smoother(model)
+    finer = _against_finer(model, coarse, refined, fine)
+    smoother = _against_smoother(model, coarse)
     power = finer.power
     if smoother.shown and smoother.power.mean() > power.mean():
         power = smoother.power
@@ -157,9 +157,13 @@ class _Comparison:
         return self.p < F_LEVEL
 
 
-def _against_finer(model: ModelFit, refined: ModelFit) -> _Comparison:
-    """Compare a map with one of twice as many intervals (method eq. 12.4)."""
-    coarse, fine = _of_marks(model), _of_marks(refined)
+def _against_finer(
+    model: ModelFit, coarse: PlacedEquations, refined: ModelFit, fine: PlacedEquations
+) -> _Comparison:
+    """Compare a map with one of twice as many intervals (method eq. 12.4).
+
+    `coarse` and `fine` are the equations of the marks alone of `model` and `refined`.
+    """
     nothing = np.zeros(2 * len(known_places(coarse)))
     dof = coarse.grid.equations_of_map - fine.determined_coefficients
     n_further = fine.determined_coefficients - coarse.determined_coefficients
@@ -178,21 +182,24 @@ def _against_finer(model: ModelFit, refined: ModelFit) -> _Comparison:
     return _Comparison(p, power)
 
 
-def _against_smoother(model: ModelFit) -> _Comparison:
-    """Compare a bilinear map with the bicubic one of the same nodes, by likelihood."""
-    coarse = _of_marks(model)
+def _against_smoother(model: ModelFit, coarse: PlacedEquations) -> _Comparison:
+    """Compare a bilinear map with the bicubic one of the same nodes, by likelihood.
+
+    `coarse` are the equations of the marks alone.
+    """
     nothing = _Comparison(1.0, np.zeros(2 * len(known_places(coarse))))
-    squares, n_readings = _squares(coarse, model.y), coarse.grid.equations_of_map
-    if not _is_bilinear(coarse) or squares <= n_readings * FLOOR**2:
+    if not _is_bilinear(coarse):
+        return nothing
+    squares = _squares(coarse, model.y)
+    if squares <= coarse.grid.equations_of_map * FLOOR**2:
         return nothing
     artifact = coarse.grid.views.artifact
     smooth = with_map(model, MapSpline.of(artifact.field, Interpolation.BICUBIC))
     if smooth is None:
         return nothing
     squares_smooth = max(_squares(_of_marks(smooth), smooth.y), FLOOR * squares)
-    dof = n_readings - coarse.determined_coefficients
-    likelihood_ratio = math.exp(min(dof / 2 * math.log(squares_smooth / squares), 0.0))
-    return _Comparison(likelihood_ratio, _apart(smooth, model))
+    exponent = coarse.dof_of_map / 2 * math.log(squares_smooth / squares)
+    return _Comparison(math.exp(min(exponent, 0.0)), _apart(smooth, model, coarse))
 
 
 def _is_bilinear(system: PlacedEquations) -> bool:
@@ -304,9 +311,9 @@ def _squares(system: PlacedEquations, y: np.ndarray) -> float:
     return float((system.grid.weight * np.abs(grid_residuals(system, y)) ** 2).sum())
 
 
-def _apart(smooth: ModelFit, model: ModelFit) -> np.ndarray:
-    """Return the squared difference of two maps of the same readings at places, (2 P,), m^2."""
-    places_m = known_places(_of_marks(model))
+def _apart(smooth: ModelFit, model: ModelFit, coarse: PlacedEquations) -> np.ndarray:
+    """Return the squared difference of two maps at the known places of one, (2 P,), m^2."""
+    places_m = known_places(coarse)
     field = _datum_of(places_m).without(
         _map_of_marks(smooth, places_m) - _map_of_marks(model, places_m)
     )
