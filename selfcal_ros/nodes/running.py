@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run a node as a process, and stop it: SIGINT and SIGTERM end it, once or repeatedly."""
 
+import contextlib
 import ctypes
 import faulthandler
 import gc
@@ -11,7 +12,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
@@ -123,10 +124,60 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
             getattr(node, "close", lambda: None)()
             # `close` may set it
             code = code or int(getattr(node, "exit_code", ExitCode.DONE))
-            node.destroy_node()
-        rclpy.try_shutdown()
+        with ended_at_the_latest(code):
+            if node is not None:
+                node.destroy_node()
+            rclpy.try_shutdown()
         ignore_signals()
     return code
+
+
+LEAVES_S = 5.0
+"""Time that a node, its work done, may take to leave the graph; `ros2 launch` waits as long."""
+SIGEV_THREAD = 2
+"""Of POSIX: a timer calls a function in a thread of its own."""
+
+
+class Notice(ctypes.Structure):
+    """What a timer does when it expires (struct sigevent)."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("kind", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("unused", ctypes.c_char * 32),
+    )
+
+
+@contextlib.contextmanager
+def ended_at_the_latest(code: int) -> Iterator[None]:
+    """End this process with `code` if the block takes longer than `LEAVES_S`.
+
+    Where many nodes end at once, Fast DDS 2.14 with an older libstdc++ (as in the wheels) can wait
+    for a minute for a callback that it keeps from ending (eProsima/Fast-DDS 6513). rclpy holds the
+    lock of the interpreter meanwhile: no thread of Python could end the process. What other nodes
+    see of this one has gone before.
+    """
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "timer_create"):  # macOS
+        yield
+        return
+    notice = Notice(
+        value=code,
+        kind=SIGEV_THREAD,
+        function=ctypes.cast(libc._exit, ctypes.c_void_p),
+    )
+    timer = ctypes.c_void_p()
+    libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(notice), ctypes.byref(timer))
+    # seconds and nanoseconds: of the period (once only), of the delay
+    delay = (ctypes.c_long * 4)(0, 0, *divmod(int(LEAVES_S * 1e9), 10**9))
+    libc.timer_settime(timer, 0, ctypes.byref(delay), None)
+    try:
+        yield
+    finally:
+        libc.timer_delete(timer)
 
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -232,8 +232,14 @@ def test_a_recorder_whose_disk_is_full_ends_with_code_2(graph, group, tmp_path):
     graph.hand.create_subscription(
         DiagnosticArray, "/diagnostics", diagnostics.append, 100
     )
-    graph.until(lambda: diagnostics, "the recorder")
-    [file] = tmp_path.glob("recorded/*.mcap")
+    bag_files: list[Path] = []
+
+    def is_recording() -> bool:
+        bag_files[:] = tmp_path.glob("recorded/*.mcap")
+        return bool(diagnostics and bag_files)
+
+    graph.until(is_recording, "the recorder and its bag")
+    [file] = bag_files
     resource.prlimit(
         recorder.pid,
         resource.RLIMIT_FSIZE,

@@ -92,6 +92,26 @@ def test_a_node_that_hangs_when_it_is_to_end_is_ended_and_says_where():
     assert " in hang" in done.stderr
 
 
+LEAVING = """
+import ctypes, time
+from selfcal_ros.nodes import running
+running.LEAVES_S = 0.2
+with running.ended_at_the_latest(3):
+    pass
+time.sleep(0.5)
+with running.ended_at_the_latest(0):
+    ctypes.PyDLL(None).sleep(60)  # holds the lock of the interpreter
+raise SystemExit(4)
+"""
+
+
+def test_a_middleware_that_hangs_when_the_work_is_done_does_not_change_the_code():
+    done = subprocess.run(
+        [sys.executable, "-c", LEAVING], check=False, timeout=50, capture_output=True
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_messages_that_were_built_before_a_field_was_added_are_one_line(
     monkeypatch, capsys
 ):
