@@ -127,8 +127,8 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
     farthest = places[beyond.argmax()]
     raise InputError(
         where,
-        f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from {-y:g} "
-        f"to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in mm?",
+        f"all points but the origin lie outside the field (x from {-x:g} to {x:g} mm, y from "
+        f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in mm?",
         "give positions in m, in the stage frame",
     )
 

@@ -152,14 +152,13 @@ def _drawn(
     picture: Picture,
     judged: Sequence[Judged],
 ) -> None:
-    """Write an image with what was found and what was rejected in it."""
+    """Write an image with what was found and what was rejected in it, under its own name."""
     size = settings.mark_size / settings.pixel_size
     with creating(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(
-        folder / f"{Path(name).stem}.png",
-        circled(picture.values, judged, size),
-    )
+    # a.png and a.tif, or one name in two folders, are two pictures
+    flat = name.strip("/").replace("/", "_").removesuffix(".png")
+    write_bytes(folder / f"{flat}.png", circled(picture.values, judged, size))
 
 
 def text_of(output: str, counts: dict[str, int]) -> str:

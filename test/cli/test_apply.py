@@ -217,8 +217,8 @@ def test_points_in_mm_are_asked_about(desk, capsys, text, words, code):
     (desk / "p.csv").write_text(text)
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", *words]) == code
     asked = (
-        "p.csv: all points lie outside the field (x from -20 to 20 mm, y from -20 to 20 mm), "
-        "up to ("
+        "p.csv: all points but the origin lie outside the field (x from -20 to 20 mm, y "
+        "from -20 to 20 mm), up to ("
     )
     assert (asked in (err := capsys.readouterr().err)) is (code == 2)
     assert ("m: is it in mm?; give positions in m" in err) is (code == 2)

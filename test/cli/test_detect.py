@@ -17,8 +17,10 @@ from PIL import Image
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.cli.detect import _drawn
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,
@@ -28,6 +30,7 @@ from selfcal_ros.topics import (
     INPUT_TOPICS,
 )
 from selfcal_ros.vision.drawing import COLOUR, REJECTED
+from selfcal_ros.vision.images import Picture
 
 SIM = """
 plan:
@@ -528,6 +531,19 @@ def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(
         in line
     )
     assert not (tmp_path / "found").exists()
+
+
+def test_images_of_one_name_are_drawn_as_several_pictures(tmp_path):
+    picture = Picture(np.zeros((8, 8), dtype=np.uint8), 255)
+    settings = DetectorSettings(pixel_size=2e-6, mark_size=1e-5)
+    for name in ("a/1.png", "b/1.png", "a/1.tif", "7"):
+        _drawn(tmp_path, settings, name, picture, [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "7.png",
+        "a_1.png",
+        "a_1.tif.png",
+        "b_1.png",
+    ]
 
 
 def test_positions_without_a_plan_are_refused(bag, tmp_path, capsys):

@@ -210,6 +210,10 @@ def test_onto_combines_with_the_active_table(capsys):
         ),
         ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
         (
+            f"kmotion R.json -o t.txt {PMAC}",
+            "--counts-per-unit: kmotion is not in counts; leave it out",
+        ),
+        (
             "pmac R.json -o t.txt --counts-per-unit 1=5",
             "--counts-per-unit: it is given for [1]",
         ),

@@ -250,6 +250,10 @@ def export(
         raise InputError("--negate", f"the sense of {name} is known", "leave it out")
     if wiring.integers and name != "beckhoff":
         raise InputError("--integers", f"{name} needs none", "leave it out")
+    if wiring.counts is not None and name != "pmac":
+        raise InputError(
+            "--counts-per-unit", f"{name} is not in counts", "leave it out"
+        )
     table = emap if active is None else combined(emap, frame, active)
     bent = 0.0 if active is None else bends_between(emap, frame, active)
     texts = form.write(table, wiring)
