@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from selfcal_ros.cli import plan_new, plan_terms
@@ -156,7 +156,39 @@ def run(args: argparse.Namespace) -> int:
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
 
 
+@dataclass(frozen=True)
+class Judged:
+    """What is known of a plan before anything moves.
+
+    Attributes
+    ----------
+    check : PlanCheck
+        Rank and unseen modes, those of the declared terms among them.
+    alone, joint : Prediction or None
+        Without and with the declared terms; None if the plan does not identify the stage.
+    """
+
+    plan: Plan
+    assumed: Assumed
+    model: tuple[ModelTerm, ...]
+    check: PlanCheck
+    alone: Prediction | None
+    joint: Prediction | None
+    terms: Sequence[TermCheck]
+    budget: PlanBudget | None
+
+
 def _check(args: argparse.Namespace, plan: Plan) -> int:
+    judged = _judged(args, plan)
+    if args.json:
+        put(_json_of(args, judged))
+    else:
+        tell("\n".join(_text_of(args, judged)))
+    identifiable = judged.check.observability.identifiable
+    return int(ExitCode.DONE if identifiable else ExitCode.NOT_IDENTIFIABLE)
+
+
+def _judged(args: argparse.Namespace, plan: Plan) -> Judged:
     assumed, sizes = plan_terms.assumed_of(args), plan_terms.sizes_of(args)
     declared = plan_terms.declared_of(args, plan)
     model = tuple(term for term in declared if term.size > 0)
@@ -170,7 +202,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
         observability = checked.observability
         if observability.identifiable:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
-            observability, joint, checks = _judge(
+            observability, joint, checks = _with_terms(
                 plan, model, assumed, sizes, (observability, alone)
             )
         if alone is not None and observability.identifiable:
@@ -178,55 +210,11 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             budget = plan_budget(
                 plan, terms, assumed, alone, declared=[term.name for term in declared]
             )
-    observability = worded_observability(observability)
-    checked = replace(checked, observability=observability)
-    if args.json:
-        summary = _check_json(plan, checked, alone, maps=args.map)
-        unit = _averaged_m(plan, assumed) * UM_PER_M
-        if alone is not None and args.sigma is not None:
-            summary["predicted"] |= {
-                "rms_u_xy_um": alone.rms_xy * unit,
-                "max_u_xy_um": alone.max_xy * unit,
-            }
-        if alone is not None:
-            summary["predicted"] |= {
-                "rms_gain_xy_with_terms": joint and joint.rms_xy,
-                "max_gain_xy_with_terms": joint and joint.max_xy,
-            }
-            if args.sigma is not None and joint is not None:
-                summary["predicted"] |= {
-                    "rms_u_xy_um_with_terms": joint.rms_xy * unit,
-                    "max_u_xy_um_with_terms": joint.max_xy * unit,
-                }
-        summary["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
-        put(summary | {"terms": plan_terms.terms_json(checks)})
-    else:
-        lines = _check_text(plan, checked, alone)
-        if alone is not None and args.sigma is not None:
-            lines.append(_in_um("XY    ", alone, plan, assumed))
-        if model and joint is not None:
-            what = f"XY with {', '.join(map(str, model))}:"
-            lines.append(
-                f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}"
-            )
-            lines += (
-                [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
-            )
-        lines += plan_budget_text(budget, plan) if budget else []
-        lines += plan_terms.terms_text(plan, checks, assumed) if checks else []
-        lines += (
-            _map_text(alone)
-            if args.map and alone and observability.identifiable
-            else []
-        )
-        tell("\n".join(lines))
-    return int(
-        ExitCode.DONE if observability.identifiable else ExitCode.NOT_IDENTIFIABLE
-    )
+    checked = replace(checked, observability=worded_observability(observability))
+    return Judged(plan, assumed, model, checked, alone, joint, checks, budget)
 
 
 def _repeated(plan: Plan, repeats: int | None) -> Plan:
-
     if repeats is None:
         return plan
     if repeats < 1:
@@ -236,7 +224,7 @@ def _repeated(plan: Plan, repeats: int | None) -> Plan:
     )
 
 
-def _judge(
+def _with_terms(
     plan: Plan,
     model: tuple[ModelTerm, ...],
     assumed: Assumed,
@@ -261,48 +249,82 @@ def _judge(
     return observability, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
-def _check_json(
-    plan: Plan,
-    checked: PlanCheck,
-    predicted: Prediction | None,
-    *,
-    maps: bool,
-) -> dict[str, Any]:
-    observability = checked.observability
-    out = {
-        "plan_id": plan.plan_id,
+def _json_of(args: argparse.Namespace, judged: Judged) -> dict[str, Any]:
+    checked, observability = judged.check, judged.check.observability
+    return {
+        "plan_id": judged.plan.plan_id,
         "rank": observability.rank,
         "unknowns": observability.unknowns,
         "deficiency": observability.deficiency,
         "identifiable": observability.identifiable,
         "modes": [mode.text for mode in observability.modes],
         "advice": [advice.text for advice in observability.advice],
-        "predicted": None,
+        "predicted": _predicted_json(args, judged, judged.alone)
+        if judged.alone
+        else None,
         "unknown_sites": checked.unknown_sites if observability.identifiable else None,
         "unchecked_sites": observability.unchecked_sites,
         "unchecked_lines": observability.unchecked_lines,
         "harmonics_untested": checked.harmonics_untested,
         "nodes_untested": checked.nodes_untested,
+        "budget": judged.budget
+        and plan_terms.budget_json(judged.budget, judged.plan, judged.assumed),
+        "terms": plan_terms.terms_json(judged.terms),
     }
-    if predicted is not None:
-        out["predicted"] = plain(
-            {
-                "rms_gain_xy": predicted.rms_xy,
-                "max_gain_xy": predicted.max_xy,
-                "rms_gain_theta": predicted.rms_theta,
-                "note": field_note(predicted, plan),
-            }
-        )
-        if maps:
-            u_gx, u_gy = predicted.u_xy
-            out["predicted"] |= plain(
-                {
-                    "u_gx": u_gx,
-                    "u_gy": u_gy,
-                    "u_g_theta": predicted.u_theta,
-                }
-            )
-    return out
+
+
+def _predicted_json(
+    args: argparse.Namespace, judged: Judged, alone: Prediction
+) -> dict[str, Any]:
+    """Return factors of the noise of an averaged reading; with ``--sigma`` µm as well."""
+    joint = judged.joint
+    unit = _averaged_m(judged.plan, judged.assumed) * UM_PER_M
+    in_um = args.sigma is not None
+    out: dict[str, Any] = {
+        "rms_gain_xy": alone.rms_xy,
+        "max_gain_xy": alone.max_xy,
+        "rms_gain_theta": alone.rms_theta,
+        "note": field_note(alone, judged.plan),
+    }
+    if args.map:
+        u_gx, u_gy = alone.u_xy
+        out |= {"u_gx": u_gx, "u_gy": u_gy, "u_g_theta": alone.u_theta}
+    if in_um:
+        out |= {
+            "rms_u_xy_um": alone.rms_xy * unit,
+            "max_u_xy_um": alone.max_xy * unit,
+        }
+    out |= {
+        "rms_gain_xy_with_terms": joint and joint.rms_xy,
+        "max_gain_xy_with_terms": joint and joint.max_xy,
+    }
+    if in_um and joint is not None:
+        out |= {
+            "rms_u_xy_um_with_terms": joint.rms_xy * unit,
+            "max_u_xy_um_with_terms": joint.max_xy * unit,
+        }
+    return plain(out)
+
+
+def _text_of(args: argparse.Namespace, judged: Judged) -> list[str]:
+    plan, assumed = judged.plan, judged.assumed
+    alone, joint = judged.alone, judged.joint
+    in_um = args.sigma is not None
+    lines = _check_text(plan, judged.check, alone)
+    if alone is not None and in_um:
+        lines.append(_in_um("XY    ", alone, plan, assumed))
+    if judged.model and joint is not None:
+        what = f"XY with {', '.join(map(str, judged.model))}:"
+        lines.append(f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}")
+        if in_um:
+            lines.append(_in_um(what, joint, plan, assumed))
+    if judged.budget:
+        lines += plan_budget_text(judged.budget, plan)
+    if judged.terms:
+        lines += plan_terms.terms_text(plan, judged.terms, assumed)
+    if args.map and alone and judged.check.observability.identifiable:
+        lines += _map_text(alone)
+    return lines
 
 
 def _check_text(

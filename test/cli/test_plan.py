@@ -38,7 +38,7 @@ def once(function):
 
 ONCE = {
     name: once(getattr(plan_verb, name))
-    for name in ("check_plan", "predict_plan", "_judge", "plan_budget")
+    for name in ("check_plan", "predict_plan", "_with_terms", "plan_budget")
 }
 
 
