@@ -13,8 +13,8 @@ from selfcal_ros.cli.camera import pose_text, require_pixels
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
-from selfcal_ros.machine.cell import connected, read_cell, with_values
-from selfcal_ros.machine.trying import Trial, values_of
+from selfcal_ros.machine.cell import Cell, connected, read_cell, with_values
+from selfcal_ros.machine.trying import Findings, Trial, values_of
 from selfcal_ros.outputs import check_outputs, write_bytes
 from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.reporting.summary.numbers import counted, with_u
@@ -104,79 +104,83 @@ def _try(args: argparse.Namespace) -> int:
         connected(cell, lambda line: tell(line, aside(args))) as machine,
     ):
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels or 0.0)
-        try:
-            pixels, marks = trial.look()
-        except NoDataError:
-            if trial.seen is not None:
-                size_px = trial.mark_pixels or min(trial.seen.shape) / 10
-                write_bytes(output, circled(trial.seen, trial.judged, size_px))
-                tell(f"{output}: what is seen", aside(args))
-            raise
-        print(
-            "position: "
-            + ", ".join(
-                f"{axis} {value + 0.0:.6g}"
-                for axis, value in zip(
-                    trial.position.names, trial.position.positions, strict=True
-                )
-            ),
-            file=aside(args),
-        )
-        if pixels is not None:
-            write_bytes(output, circled(pixels, trial.judged, trial.mark_pixels))
-            tell(
-                f"{output}: {counted(len(marks), 'mark')} of {trial.mark_pixels:.3g} pixels in "
-                f"an image of {pixels.shape[1]} x {pixels.shape[0]}",
-                aside(args),
-            )
+        marks = _look(args, trial, output)
         if not args.yes and not _agrees(args, trial.step_m):
-            say(args, "nothing was moved or written", {"marks": len(marks)})
+            say(args, "nothing was moved or written", {"marks": marks})
             return int(ExitCode.DONE)
-        outcome = trial.move()
-    values, notes = values_of(outcome)
-    if values:
-        with_values(cell.path, "detector", values, notes)
-    if outcome.settling_s > cell.settle.time:
-        with_values(
-            cell.path, "settle", {"time": float(f"{outcome.settling_s:.2g}")}, {}
-        )
-    with_values(
-        cell.path,
-        "found",
-        {
-            f"backlash_{axis}": asdict(reversal)
-            for axis, reversal in outcome.reversal.items()
-        }
-        | {"settling_time": outcome.settling_s, "noise": outcome.noise_m},
-        {},
-    )
-    lines = [] if outcome.camera is None else [pose_text(outcome.camera, args.cell)]
-    lines += [
-        f"backlash of {axis}: {with_u(reversal.value / M_PER_UM, reversal.u / M_PER_UM)} µm (k=1)"
-        for axis, reversal in outcome.reversal.items()
-    ]
-    lines.append(
-        f"at rest {outcome.settling_s:.2g} s after a move; noise of a mark "
-        f"{outcome.noise_m / M_PER_UM:.2g} µm"
-    )
-    lines += [f"note: {note}" for note in outcome.notes]
+        findings = trial.move()
+    values = _keep(cell, findings)
+    backlash = {axis: asdict(reversal) for axis, reversal in findings.reversal.items()}
     say(
         args,
-        "\n".join(lines),
+        "\n".join(_found_text(args.cell, findings)),
         {
             "file": args.cell,
-            "seen": output if pixels is not None else "",
-            "marks": len(marks),
+            "seen": output if trial.seen is not None else "",
+            "marks": marks,
             **values,
-            "backlash": {
-                axis: asdict(reversal) for axis, reversal in outcome.reversal.items()
-            },
-            "settling_time": outcome.settling_s,
-            "noise": outcome.noise_m,
-            "notes": list(outcome.notes),
+            "backlash": backlash,
+            "settling_time": findings.settling_s,
+            "noise": findings.noise_m,
+            "notes": list(findings.notes),
         },
     )
     return int(ExitCode.DONE)
+
+
+def _look(args: argparse.Namespace, trial: Trial, output: str) -> int:
+    """Tell and draw what the cell sees where it stands; return the number of marks."""
+    try:
+        pixels, marks = trial.look()
+    except NoDataError:
+        if trial.seen is not None:
+            size_px = trial.mark_pixels or min(trial.seen.shape) / 10
+            write_bytes(output, circled(trial.seen, trial.judged, size_px))
+            tell(f"{output}: what is seen", aside(args))
+        raise
+    at = zip(trial.position.names, trial.position.positions, strict=True)
+    print(
+        "position: " + ", ".join(f"{axis} {value + 0.0:.6g}" for axis, value in at),
+        file=aside(args),
+    )
+    if pixels is not None:
+        write_bytes(output, circled(pixels, trial.judged, trial.mark_pixels))
+        tell(
+            f"{output}: {counted(len(marks), 'mark')} of {trial.mark_pixels:.3g} pixels in "
+            f"an image of {pixels.shape[1]} x {pixels.shape[0]}",
+            aside(args),
+        )
+    return len(marks)
+
+
+def _keep(cell: Cell, findings: Findings) -> dict[str, object]:
+    """Write what was found into the file of the cell; return the detector's part of it."""
+    values, notes = values_of(findings)
+    if values:
+        with_values(cell.path, "detector", values, notes)
+    if findings.settling_s > cell.settle.time:
+        settle = {"time": float(f"{findings.settling_s:.2g}")}
+        with_values(cell.path, "settle", settle, {})
+    found: dict[str, object] = {
+        f"backlash_{axis}": asdict(reversal)
+        for axis, reversal in findings.reversal.items()
+    }
+    found |= {"settling_time": findings.settling_s, "noise": findings.noise_m}
+    with_values(cell.path, "found", found, {})
+    return values
+
+
+def _found_text(path: str, findings: Findings) -> list[str]:
+    lines = [] if findings.camera is None else [pose_text(findings.camera, path)]
+    lines += [
+        f"backlash of {axis}: {with_u(reversal.value / M_PER_UM, reversal.u / M_PER_UM)} µm (k=1)"
+        for axis, reversal in findings.reversal.items()
+    ]
+    lines.append(
+        f"at rest {findings.settling_s:.2g} s after a move; noise of a mark "
+        f"{findings.noise_m / M_PER_UM:.2g} µm"
+    )
+    return [*lines, *(f"note: {note}" for note in findings.notes)]
 
 
 def _agrees(args: argparse.Namespace, step_m: float) -> bool:
