@@ -132,64 +132,57 @@ class DetectionsSeen:
         loose : dict
             Reason -> detections that belong to no view.
         """
-        rejected = dict(loose)
+        rejected = Counter(loose)
         for readings in views.values():
-            for reason, count in readings.rejected.items():
-                rejected[reason] = rejected.get(reason, 0) + count
+            rejected.update(readings.rejected)
         used = sum(readings.used for readings in views.values())
         size = self._other_size(views, rejected, used)
         if size is not None:
             return {None: size}
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
-        of_views = [(view.rejected, view.used) for view in views.values()]
-        most = any(
-            main_reason(*counts, placed=True)
-            for counts in ((rejected, used), *of_views)
-        )
-        lag = self._lag(views) if most else None
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
-        joints = not any(pose.planned for pose in poses.values())
         faults = texts(poses)
-        alike = (
-            faults.get(next(iter(views)), "")
+        joints = not any(pose.planned for pose in poses.values())
+        session = self._evidence(
+            rejected,
+            used,
+            marks,
+            joints=joints,
+            lies=faults.get(next(iter(views)), "")
             if len(views) == 1
-            else mirrored_alike(poses.values())
+            else mirrored_alike(poses.values()),
         )
-        session_evidence = self._evidence(
-            rejected, used, marks, joints=joints, lies=alike
-        )
-        late = self._late(lag, poses, session_evidence)
-        session_evidence = replace(session_evidence, late=late)
-        finding = diagnose(session_evidence)
-        finding_of_view: dict[int | None, RejectionFinding | None] = {
-            index: diagnose(
+        of_views = [(view.rejected, view.used) for view in views.values()]
+        if any(
+            main_reason(*counts, placed=True)
+            for counts in ((rejected, used), *of_views)
+        ):
+            late = self._late(self._lag(views), poses, session)
+            session = replace(session, late=late)
+        finding = diagnose(session)
+        named: dict[int | None, RejectionFinding] = {}
+        for index, readings in views.items():
+            of_view = diagnose(
                 self._evidence(
                     readings.rejected,
                     readings.used,
-                    {i: marks[i] for i in marks if i == index},
+                    {index: marks[index]} if index in marks else {},
                     joints=joints and not faults,
                     lies=faults.get(index, ""),
-                    late=late,
+                    late=session.late,
                     view=index,
                 )
             )
-            for index, readings in views.items()
-        }
-        named = {
-            index: view_finding
-            for index, view_finding in finding_of_view.items()
-            if view_finding is not None
-        }
-        if finding is None or (
-            not (alike or late)
-            and faults.keys() & named.keys()
-            and not (
-                finding.reason in PLACED and joints and wrong_joints(session_evidence)
-            )
-        ):
+            if of_view is not None:
+                named[index] = of_view
+        if finding is None:
             return named
-        return {None: finding}
+        all_alike = bool(session.lies or session.late) or (
+            finding.reason in PLACED and joints and wrong_joints(session) is not None
+        )
+        views_lie_wrong = bool(faults.keys() & named.keys())
+        return named if views_lie_wrong and not all_alike else {None: finding}
 
     def _lag(self, views: Mapping[int, ViewReadings]) -> Lag | None:
         """Return when the stage rests at the marks, if not at the stamps of detections."""
