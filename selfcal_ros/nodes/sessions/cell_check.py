@@ -31,7 +31,12 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.nodes.sessions.cell_faults import FOLLOWS, explaining, slope_of
+from selfcal_ros.nodes.sessions.cell_faults import (
+    FOLLOWS,
+    Fault,
+    explaining,
+    slope_of,
+)
 from selfcal_ros.nodes.sessions.health import Level, Ports
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
@@ -594,28 +599,7 @@ class CellCheck:
         rejected = measurements.all_rejected()
         total = len(self._seen)
         first = len(self.items)
-        ages = [age for _, age, _ in self._seen] or [0]
-        age, earliest = (
-            float(value) * S_PER_NS for value in (np.median(ages), min(ages))
-        )
-        outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
-        if self._n_early:
-            self._tell(
-                "commands",
-                False,
-                f"{self._n_early} detections between PLACE and MEASURE",
-                "measure after MEASURE: until then the plate may still be moved",
-            )
-        # whether the stage stood at the marks at these stamps
-        good = progress.readings.used > (total - outside) / 2
-        self._tell(
-            "detection clock",
-            not outside and age <= OLDEST_S and earliest >= -self._settings.clock_limit,
-            f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the view",
-            "publish each detection as soon as it is found"
-            if good
-            else "stamp detections at the instant of exposure, by the clock of the joint states",
-        )
+        self._judge_stamps(progress, rejected)
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
         self._tell(
             "rest",
@@ -623,13 +607,53 @@ class CellCheck:
             f"{moving} of {total} exposures while the stage moved, or without samples around them",
             REMEDY[Reason.MOVING],
         )
+        fault = self._explaining(rejected)
+        ids_fit = self._judge_ids(rejected, fault)
+        self._judge_loss(progress, rejected, total)
+        follows, signs_told = self._judge_wiring(measurements, progress.check_done)
+        if follows and self.view.angular and ids_fit:
+            self._judge_theta(measurements)
+        self.items[first:] = grouped(
+            self.items[first:], "ids" if fault else "signs" * signs_told
+        )
+
+    def _judge_stamps(
+        self, progress: ViewProgress, rejected: Mapping[str, int]
+    ) -> None:
+        if self._n_early:
+            self._tell(
+                "commands",
+                False,
+                f"{self._n_early} detections between PLACE and MEASURE",
+                "measure after MEASURE: until then the plate may still be moved",
+            )
+        ages = [age for _, age, _ in self._seen] or [0]
+        age, earliest = (
+            float(value) * S_PER_NS for value in (np.median(ages), min(ages))
+        )
+        outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
+        stood_at_marks = progress.readings.used > (len(self._seen) - outside) / 2
+        self._tell(
+            "detection clock",
+            not outside and age <= OLDEST_S and earliest >= -self._settings.clock_limit,
+            f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the view",
+            "publish each detection as soon as it is found"
+            if stood_at_marks
+            else "stamp detections at the instant of exposure, by the clock of the joint states",
+        )
+
+    def _explaining(self, rejected: Mapping[str, int]) -> Fault | None:
+        """Return the fault of the cell that explains the rejected detections, if any."""
         # offsets in any unit contradict each other less
         bad = sum(
             count
             for reason, count in rejected.items()
             if reason in REMEDY and reason != Reason.OUTLIER
         )
-        fault = explaining(self._command, self._events, self._settings) if bad else None
+        return explaining(self._command, self._events, self._settings) if bad else None
+
+    def _judge_ids(self, rejected: Mapping[str, int], fault: Fault | None) -> bool:
+        """Tell, and return, whether detections are where their ids, or their marks, are."""
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {
             reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)
@@ -641,14 +665,9 @@ class CellCheck:
         if fault is not None:
             figure = f"{fault.what} ({figure})"
             remedy = fault.remedy
-        self._tell("ids", not mistaken and fault is None, figure, remedy)
-        self._judge_loss(progress, rejected, total)
-        follows, signs_told = self._judge_wiring(measurements, progress.check_done)
-        if follows and self.view.angular and not mistaken and fault is None:
-            self._judge_theta(measurements)
-        self.items[first:] = grouped(
-            self.items[first:], "ids" if fault else "signs" * signs_told
-        )
+        fit = not mistaken and fault is None
+        self._tell("ids", fit, figure, remedy)
+        return fit
 
     def _judge_loss(
         self, progress: ViewProgress, rejected: Mapping[str, int], total: int
