@@ -351,12 +351,8 @@ class Rewriter:
         """Return the lines of a move in XY."""
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
-        travels = act.does in ("rapid", "hole") or (
-            act.does == "line"
-            and not line.named("E")
-            and (self.prints or (self._printer and act.name == "G0"))
-        )
-        if not cmath.isfinite(end_m if travels else start_m + end_m):
+        known_m = end_m if self._travels(act, line) else start_m + end_m
+        if not cmath.isfinite(known_m):
             self._refuse(
                 "the position before this line is not known",
                 "write an absolute move of X and Y before it"
@@ -365,21 +361,20 @@ class Rewriter:
         limit_m = (1 - OF_SAMPLES) * self._tolerance_m
         if act.does == "arc":
             centre_m = start_m + complex(line.number("I"), line.number("J")) * unit_m
-            path_m = self._arc(
-                start_m, end_m, centre_m, sense=-1 if act.name == "G2" else 1
-            )
+            sense = -1 if act.name == "G2" else 1
+            path_m = self._arc(start_m, end_m, centre_m, sense=sense)
             limit_m -= abs(abs(end_m - centre_m) - abs(start_m - centre_m))
         elif act.does == "line" and cmath.isfinite(start_m):
-            path_m = np.linspace(
-                start_m, end_m, self._count(abs(end_m - start_m), self._step_m)
-            )
+            count = self._count(abs(end_m - start_m), self._step_m)
+            path_m = np.linspace(start_m, end_m, count)
         else:
             path_m = np.array([end_m, end_m])
+        self._reach(path_m)
 
         commanded_m = path_m + np.dot((1, 1j), self._correct(path_m.real, path_m.imag))
         vertices = simplified(commanded_m, limit_m)[1:]
-        lines: list[str] = []
         shared = self._shared(line) if len(vertices) > 1 else {}
+        lines: list[str] = []
         for i in vertices:
             place = {
                 "X": commanded_m[i].real / unit_m,
@@ -391,17 +386,24 @@ class Rewriter:
             texts = {
                 axis: self._coordinate(axis, value) for axis, value in place.items()
             }
-            lines.append(
-                _text(act, line if not lines else ProgramLine([], {}, []), texts)
-            )
-
-        corners_m = np.stack([path_m.real, path_m.imag], axis=1)
-        self.reach_m[0] = np.minimum(self.reach_m[0], corners_m.min(axis=0))
-        self.reach_m[1] = np.maximum(self.reach_m[1], corners_m.max(axis=0))
-        self._drawn = True
+            rest = ProgramLine([], {}, []) if lines else line
+            lines.append(_text(act, rest, texts))
         self.moves += 1
         self.pieces += len(lines)
         return lines
+
+    def _travels(self, act: Code, line: ProgramLine) -> bool:
+        """Return whether the way of a move counts for nothing, only where it ends."""
+        without_extruder = act.does == "line" and not line.named("E")
+        prints_nothing = self.prints or (self._printer and act.name == "G0")
+        return act.does in ("rapid", "hole") or (without_extruder and prints_nothing)
+
+    def _reach(self, path_m: np.ndarray) -> None:
+        """Widen the field of the program by a path."""
+        places_m = np.stack([path_m.real, path_m.imag], axis=1)
+        self.reach_m[0] = np.minimum(self.reach_m[0], places_m.min(axis=0))
+        self.reach_m[1] = np.maximum(self.reach_m[1], places_m.max(axis=0))
+        self._drawn = True
 
     def _shared(self, line: ProgramLine) -> dict[str, float]:
         """Return where the other axes of a split move start, 0 if by increments."""
