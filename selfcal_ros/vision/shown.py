@@ -2,6 +2,7 @@
 """What an image shows that repeats: for the advice where no mark of the given size was found."""
 
 from dataclasses import dataclass
+from statistics import median_high
 
 import numpy as np
 from scipy import ndimage
@@ -76,6 +77,6 @@ def _alike(mask: np.ndarray, polarity: str) -> Spots | None:
             sides.append(side)
     if not sides:
         return None
-    typical = float(np.median(sides))
+    typical = median_high(sides)  # one of them, so that it is like itself
     alike = [side for side in sides if abs(side - typical) <= ALIKE * typical]
     return Spots(float(np.mean(alike)), polarity, len(alike))

@@ -30,3 +30,12 @@ def test_the_side_and_the_polarity_of_what_repeats(side, dark):
 
 def test_an_even_image_shows_nothing():
     assert spots_in(np.full((50, 60), 7, dtype=np.uint8)) is None
+
+
+def test_of_two_spots_that_differ_the_larger_is_stated():
+    # one mark and a speck of dust beside it: neither is like the mean of both
+    image = np.full((60, 60), 200, dtype=np.uint8)
+    image[20:34, 20:34] = 40
+    image[45:49, 45:49] = 40
+    found = spots_in(image)
+    assert (found.side_px, found.polarity, found.number) == (14.0, "dark", 1)
