@@ -103,8 +103,8 @@ def camera_pose(
     NoDataError
         If too few marks were followed.
     InputError
-        If the stage moved along one line, the marks do not follow it, or the image is not a similar
-        image of the motion.
+        If the stage did not move, or along one line, the marks do not follow it, or the image is
+        not a similar image of the motion.
     """
     number = np.concatenate([np.zeros(0, int), *tracks(images)])
     stage = np.repeat(positions, [len(places) for places in images], axis=0)
@@ -135,10 +135,9 @@ def camera_pose(
         ).T[number]
     )
     span = np.linalg.svd(stage, compute_uv=False)
-    if span[1] < LEAST_SPAN * span[0]:
-        raise InputError(
-            "images", "the stage moved along one line only", "move it in x and in y"
-        )
+    if span[1] <= LEAST_SPAN * span[0]:
+        motion = "moved along one line only" if span[0] else "did not move"
+        raise InputError("images", f"the stage {motion}", "move it in x and in y")
     by_stage = np.linalg.lstsq(stage, place, rcond=None)[0].T  # px per m
     residual = place - stage @ by_stage.T
     noise = float(np.sqrt(np.square(residual).sum() / (2 * (len(number) - count - 2))))

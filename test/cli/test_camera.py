@@ -158,14 +158,14 @@ def test_images_that_are_not_used_are_said(tmp_path, capsys, monkeypatch):
     assert "1 x messages on /stage/image could not be decoded" in said
 
 
-def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(f"{__name__}.MOVES", [(0.0, 0.0), (3e-5, 0.0), (6e-5, 0.0)])
+@pytest.mark.parametrize(
+    ("step", "said"), [(3e-5, "moved along one line only"), (0.0, "did not move")]
+)
+def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch, step, said):
+    monkeypatch.setattr(f"{__name__}.MOVES", [(0.0, 0.0), (step, 0.0), (2 * step, 0.0)])
     bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
-    assert (
-        "the stage moved along one line only; move it in x and in y"
-        in capsys.readouterr().err
-    )
+    assert f"the stage {said}; move it in x and in y" in capsys.readouterr().err
     assert not (tmp_path / "nodes.yaml").exists()
 
 
