@@ -23,10 +23,13 @@ function show(box) {
   const camera = new PerspectiveCamera(35, 1, 0.01, 100);
   camera.up.set(0, 0, 1);
   const controls = new OrbitControls(camera, renderer.domElement);
+  // whoever scrolls past the map on the way down the page does not zoom it
+  controls.enableZoom = false;
+  renderer.domElement.style.touchAction = "pan-y";
   const select = document.createElement("select");
   const reset = document.createElement("button");
   const readout = document.createElement("output");
-  reset.textContent = "view from the front";
+  reset.textContent = "x to the right, y away";
   for (const name of Object.keys(QUANTITIES)) select.add(new Option(name, name));
   select.setAttribute("aria-label", "height");
   const bar = document.createElement("p");
@@ -82,7 +85,7 @@ function show(box) {
     const corners = [[-a, -b], [a, -b], [a, b], [-a, b]];
     const outline = corners.flatMap((corner, n) => [...corner, 0, ...corners[(n + 1) % 4], 0]);
     floor.geometry.setAttribute("position", new BufferAttribute(new Float32Array(outline), 3));
-    readout.textContent = `largest ${largest.toPrecision(3)} µm; drag to turn, wheel to zoom`;
+    readout.textContent = `largest ${largest.toPrecision(3)} µm; drag to turn, then wheel to zoom`;
     paint();
   }
   function paint() { renderer.render(scene, camera); }
@@ -114,6 +117,8 @@ function show(box) {
     readout.textContent = `x ${near.x} mm, y ${near.y} mm: Gx ${near.gx} µm, Gy ${near.gy} µm, `
       + `U ${near.u ?? "unknown"} µm`;
   });
+  renderer.domElement.addEventListener("pointerdown", () => { controls.enableZoom = true; });
+  renderer.domElement.addEventListener("pointerleave", () => { controls.enableZoom = false; });
   controls.addEventListener("change", paint);
   select.addEventListener("change", draw);
   reset.addEventListener("click", front);
