@@ -231,11 +231,11 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     )
     heading = "no view yet"
     if command and views:
-        heading = (
-            f"view {index + 1} of {views}: {name}"
-            if command["phase"] in ("PLACE", "MEASURE")
-            else f"{min(index, views)} of {views} views done"
-        )
+        view = f"view {index + 1} of {views}: {name}"
+        heading = {
+            "DONE": f"{min(index, views)} of {views} views done",
+            "ABORT": f"aborted in {view}",
+        }.get(command["phase"], view)
     run = values.get("run_id") or (command or {}).get("run_id") or "-"
     plan = values.get("plan_id") or (command or {}).get("plan_id") or "-"
     return [

@@ -242,7 +242,7 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
             ("abort", session.give_up),
             ("confirm_view", lambda: session.act(machine.confirm)),
             ("redo_view", lambda: session.act(machine.redo)),
-            ("skip_view", lambda: session.act(machine.skip)),
+            ("skip_view", session.skip),
         ):
             self.service(Trigger, f"~/{name}", lambda request, act=act: act())
         self.every(TICK_S, self._on_timer)

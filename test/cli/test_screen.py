@@ -336,7 +336,7 @@ def test_a_small_terminal_says_what_is_to_be_done_and_asks_for_more_room():
     [
         ("PLACE", "17", "view 2 of 4: rot90"),
         ("DONE", "17", "1 of 4 views done"),
-        ("ABORT", "17", "1 of 4 views done"),
+        ("ABORT", "17", "aborted in view 2 of 4: rot90"),
         ("PLACE", "18", "views 4 of 4; an earlier run"),
     ],
 )

@@ -135,7 +135,9 @@ def test_redo_skip_and_abort(desk):
     desk.ask("confirm_view")
     assert desk.ask("redo_view").success
     second = f"view 2 of {len(PLAN.views)} '{PLAN.views[1].name}'"
-    assert desk.ask("skip_view").message.endswith(second)
+    assert desk.ask("skip_view").message.endswith(
+        f"{second}; view '{PLAN.views[0].name}' is left as it is"
+    )
     assert desk.ask("abort").message == f"aborted: {second}"
     desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 0), (PLACE, 1), (ABORT, 1))
     assert desk.ask("start").success

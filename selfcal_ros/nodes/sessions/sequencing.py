@@ -172,6 +172,11 @@ class SequencingSession:
             f"{state}: view {index + 1} of {len(plan.views)} '{plan.views[index].name}'"
         )
 
+    def skip(self) -> str:
+        """Continue with the next view, and say which one is left as it is."""
+        answer = self.act(self.machine.skip)
+        return f"{answer}; view '{self.machine.skipped[-1]}' is left as it is"
+
     def give_up(self) -> str:
         """Abort the running plan, or stop waiting for missing nodes."""
         if self.waiting:
