@@ -12,6 +12,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+UNNAMED = "a node of unknown name"
+
 
 def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[str]:
     """Return the topics that the node named `by` does not hear reliably, with the reason if known.
@@ -58,7 +60,7 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
         )
         if reader.qos_profile.durability == DurabilityPolicy.VOLATILE
     ]
-    return matched >= len(readers) and by in [_name(reader) for reader in readers]
+    return matched >= len(readers) and by in [node_of(reader) for reader in readers]
 
 
 def others_on(
@@ -79,13 +81,19 @@ def others_on(
     allowed = Counter(own_nodes)
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        for name in Counter(map(_name, offers)) - allowed:
+        for name in Counter(map(node_of, offers)) - allowed:
             topics_of_node.setdefault(name, []).append(topic)
     return topics_of_node
 
 
-def _name(reader: TopicEndpointInfo) -> str:
-    return f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"
+def node_of(endpoint: TopicEndpointInfo) -> str:
+    """Return the node of a publisher or subscriber, with its namespace.
+
+    An endpoint is found before the name of its node, and outlives it for a moment.
+    """
+    if endpoint.node_name == "_NODE_NAME_UNKNOWN_":  # of rmw
+        return UNNAMED
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 def _reliabilities(
@@ -97,5 +105,5 @@ def _reliabilities(
     return [
         reader.qos_profile.reliability
         for reader in node.get_subscriptions_info_by_topic(publisher.topic_name)
-        if by == _name(reader)
+        if by == node_of(reader)
     ]

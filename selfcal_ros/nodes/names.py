@@ -25,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
 from selfcal_ros.model.plan_form import MAX_VIEWS
+from selfcal_ros.nodes.hearing import node_of
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 
@@ -135,7 +136,7 @@ COMMANDED = (MOTION, CORRECTED_MOTION)
 def unheard(node: Node, subscribed: Mapping[str, Topic]) -> Diagnosis:
     """Name the publishers whose type or quality of service keeps their messages from this node."""
     faults = [
-        f"{topic.name}: no messages are received from {_name(other)} {why}"
+        f"{topic.name}: no messages are received from {node_of(other)} {why}"
         for name, topic in subscribed.items()
         for other in node.get_publishers_info_by_topic(name)
         if (why := _mismatch(topic, other, publishes=True))
@@ -146,7 +147,7 @@ def unheard(node: Node, subscribed: Mapping[str, Topic]) -> Diagnosis:
 def unreached(node: Node, published: Mapping[str, Topic]) -> Diagnosis:
     """Name the subscribers that this node's messages do not reach, by type or by QoS."""
     faults = [
-        f"{topic.name}: no messages reach {_name(other)} {why}"
+        f"{topic.name}: no messages reach {node_of(other)} {why}"
         for name, topic in published.items()
         for other in node.get_subscriptions_info_by_topic(name)
         if (why := _mismatch(topic, other, publishes=False))
@@ -183,7 +184,7 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
         if len(offers) > 1:
             shared_topics.append(
                 f"{topic} has {len(offers)} publishers: "
-                f"{', '.join(sorted(map(_name, offers)))}; only one is allowed"
+                f"{', '.join(sorted(map(node_of, offers)))}; only one is allowed"
             )
     return Diagnosis(
         Level.WARN if shared_topics else Level.OK, "; ".join(shared_topics)
@@ -201,14 +202,14 @@ def rivals(node: Node, topics: Iterable[str]) -> str:
         if (
             len(
                 {
-                    (_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT]))
+                    (node_of(offer), bytes(offer.endpoint_gid[:PARTICIPANT]))
                     for offer in offers
                 }
             )
             > 1
         ):
             shared_topics.append(
-                f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(_name, offers)))}"
+                f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(node_of, offers)))}"
             )
     return "; ".join(shared_topics)
 
@@ -230,10 +231,6 @@ def offered(topic: Topic) -> dict:
         transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
         depth=topic.qos.depth,
     )
-
-
-def _name(offer: Any) -> str:
-    return f"{offer.node_namespace.rstrip('/')}/{offer.node_name}"
 
 
 class MatchedInput:

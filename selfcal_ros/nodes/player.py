@@ -13,7 +13,7 @@ from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.hearing import hears, not_heard, others_on
+from selfcal_ros.nodes.hearing import UNNAMED, hears, not_heard, others_on
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.settings.nodes import (
     CollectorSettings,
@@ -45,9 +45,8 @@ BURST, SLICE_S = 100, 0.02
 """Messages between checks of the time and of the subscribers' progress; longest step."""
 LOOK_S = 1.0
 """Time for finding other publishers before the first message, and between looks after it."""
-UNNAMED, NAME_S = "_NODE_NAME_UNKNOWN_", 10.0
-"""Name of a node in the graph whose publishers are found before itself; longest wait for its
-own."""
+NAME_S = 10.0
+"""Longest wait for the name of a node whose publishers are found before it."""
 UNHEARD_RATE = 4000
 """Messages per second while no collector reports its progress."""
 
@@ -215,7 +214,7 @@ class Player:
         named = {
             name: topics
             for name, topics in other_nodes.items()
-            if not name.endswith(UNNAMED) or looked_s > NAME_S
+            if name != UNNAMED or looked_s > NAME_S
         }
         for name, topics in named.items():
             raise InputError(

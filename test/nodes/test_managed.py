@@ -5,6 +5,7 @@ import gc
 import sys
 import time
 import weakref
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,6 +22,7 @@ from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.hearing import node_of
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -355,6 +357,13 @@ def test_a_subscriber_that_is_not_reached_is_named_once(graph, capfd, kind, qos,
     finally:
         other.close()
     assert capfd.readouterr().err.count("no messages reach /hand") == 1
+
+
+def test_a_node_whose_name_is_not_known_yet_is_said_in_words():
+    endpoint = SimpleNamespace(
+        node_name="_NODE_NAME_UNKNOWN_", node_namespace="_NODE_NAMESPACE_UNKNOWN_"
+    )
+    assert node_of(endpoint) == "a node of unknown name"
 
 
 @pytest.mark.usefixtures("quick_beat")
