@@ -48,8 +48,8 @@ class StepWatch:
     A step changes the difference of stamps and reception at once and permanently: the values before
     and after do not overlap. Late, bundled or lost messages look different: when a delay ends, and
     delayed messages were lost, stamps get closer to their reception again, but no closer
-    than before. If the clock of reception steps as well, only a step back can be distinguished
-    from a pause.
+    than before. Messages that are sent again at once are no step either. If the clock of reception
+    steps as well, only a step back can be distinguished from a pause.
 
     Parameters
     ----------
@@ -159,7 +159,13 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     stamps, received = next_low[1] - high[1], next_low[2] - high[2]
     clear = np.abs(by) > np.maximum(limit_ns, 2 * scatter)
     ahead = clear & (by > 0) & (stamps > limit_ns) & (stamps > received + limit_ns)
-    back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2)
+    # messages sent again at once, as after a lost connection, go back but outrun their reception
+    outrun, next_outrun = (
+        (highest[1] - lowest[1]) - (highest[2] - lowest[2]) > limit_ns // 2
+        for lowest, highest in (before, after)
+    )
+    sent_again = next_outrun & ~outrun
+    back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2) & ~sent_again
     # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
     together = (

@@ -136,6 +136,17 @@ def faster():
     return TRUE, TRUE[0] + (TRUE - TRUE[0]) // 8
 
 
+def sent_again(number=60):
+    """A connection is lost for a second; then the last messages are sent once more, at once."""
+    again = slice(1000 - number, 1000)
+    return (
+        np.concatenate([TRUE[:1000], TRUE[again], TRUE[1000:]]),
+        np.concatenate(
+            [TRUE[:1000], TRUE[999] + S + np.arange(number), TRUE[1000:] + 2 * S]
+        ),
+    )
+
+
 @pytest.mark.parametrize(
     "case",
     [
@@ -146,6 +157,7 @@ def faster():
         shuffled,
         mixed,
         faster,
+        sent_again,
         late_then_dropped,
         late_for_long,
     ],
