@@ -662,6 +662,9 @@ class SolvingSession:
             or is_qualified(shown.result)
         )
         state = self._state() if has_outcome else "waiting for views"
+        if shown.problem is not None and self._newer(self._planned):
+            # of a run that ended early: nobody adds its views any more
+            fine, state = True, f"the earlier run {shown.run.run_id}: {state}"
         wrong = [line for line in (self._unsaved, newer) if line]
         return Diagnosis(
             Level.OK if fine and not wrong else Level.WARN,

@@ -364,6 +364,16 @@ def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
     assert desk.session.diagnosis().level == Level.WARN
 
 
+def test_what_an_earlier_run_lacks_is_no_warning_while_a_newer_one_is_measured(desk):
+    """A restarted solver is sent the readings of an aborted run again."""
+    desk.take(views_of(run_id=str(NOW))[:1])
+    assert desk.session.diagnosis().level == Level.WARN
+    desk.session.take_command(command(4, run_id=str(NOW + 5)))
+    told = desk.session.diagnosis()
+    assert told.level == Level.OK
+    assert told.message.startswith(f"the earlier run {NOW}: the marks that were read")
+
+
 def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     lines = views_of()[3:]
     assert [len(view.m) for view in lines] == [0]
