@@ -64,6 +64,10 @@ class StagePlaces:
         """How far the stage stood off the sites, in pitches (rms)."""
         return rms(np.abs(self.away_m)) / self.pitch_m
 
+    def true_distance_m(self, error: np.ndarray) -> float:
+        """Return how far off the sites the stage with an error (P,), m, truly stood (rms), m."""
+        return rms(np.abs(self.away_m - error))
+
     def differences(
         self, field: np.ndarray, near: np.ndarray | None = None, *, local: bool = False
     ) -> np.ndarray:

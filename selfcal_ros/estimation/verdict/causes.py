@@ -245,7 +245,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
         u=float(u_of_effect[worst]),
         unit="m",
         p=p,
-        details=CauseDetails(away=places.distance * places.pitch_m),
+        details=CauseDetails(away=places.true_distance_m(error_there)),
         effect_rms=rms(effect),
         effect_max=float(effect[worst]),
     )

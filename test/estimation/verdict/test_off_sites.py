@@ -167,6 +167,13 @@ def test_a_stage_that_is_rough_there_has_a_larger_u(sense):
     assert "place the plate closer to its nominal pose" in cause.text
 
 
+def test_how_far_off_the_sites_is_where_the_stage_truly_stood():
+    """It stands on them, indicated 84 um beside them by its error; the datum leaves 3 um."""
+    result = calibrate(readings(follow=False, beside=0 * BESIDE_M, rough_m=1e-4), BARE)
+    (cause,) = (c for c in result.verdict.causes if c.name == "off_sites")
+    assert cause.details.away < 5e-6
+
+
 def test_a_stage_too_rough_for_it_is_not_qualified():
     verdict = calibrate(readings(follow=True, rough_m=1e-7), BARE).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
