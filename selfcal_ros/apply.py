@@ -325,7 +325,7 @@ class StageMap(Compensator):
             * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n] - cover[j, i + n])
         )
         if anywhere:
-            worst = (self.halfway**2).sum(axis=1)
+            worst = (self.halfway**2 + self.edges.max(axis=2) ** 2).sum(axis=1)
             square += 2 * (ex**2 * worst[0] + ey**2 * worst[1])
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one

@@ -391,6 +391,18 @@ def test_a_distance_anywhere_has_the_interpolation_of_its_own_direction(monkeypa
         assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * worst, rel=1e-6)
 
 
+def test_a_distance_anywhere_may_end_in_the_cell_at_an_edge(monkeypatch):
+    plate = Artifact(3, 0.01, 0, 3)
+    stage = stage_of(plate, np.diag(np.full(18, 1e-18)), monkeypatch)
+    stage.edges = np.zeros((2, 2, 2))
+    inside = stage.length_uncertainty()
+    stage.edges[1, 0, 1] = 8e-9  # of Gy along x
+    a, b = stage.length_uncertainty()
+    assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * np.sqrt(130) * 1e-9)
+    assert a + b * 0.01 > 5 * (inside[0] + inside[1] * 0.01)
+    assert stage.length_uncertainty(anywhere=False) == inside
+
+
 def test_cells_of_an_oblong_field_share_no_error_of_interpolation(monkeypatch):
     """Five nodes along x, nine along y: the last two cells of y are different ones."""
     plate = Artifact(5, 0.01, 0, 9)

@@ -9,7 +9,7 @@ The error map contains G = indicated - true at the true position of the marks, h
 
 import math
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import get_args
 
 import numpy as np
@@ -27,13 +27,22 @@ from selfcal_ros.compensation.cells import (
 )
 from selfcal_ros.compensation.circle import MAX_SLOPE, Circle, steep
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.error_map import ErrorMap, error_halfway, share_between
+from selfcal_ros.model.error_map import (
+    ErrorMap,
+    along_axes,
+    error_at_edges,
+    error_halfway,
+    share_between,
+)
 
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them gets near twice MAX_SLOPE."""
 
 PER_STEP = 4
 """Places from one node to the next at which `Compensator.between` looks."""
+
+PASSED_ON = {"bilinear": 0.0, "bicubic": 2 - math.sqrt(3)}
+"""Part of an error in one cell that interpolation has in the next: the decay of a cubic spline."""
 
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -89,7 +98,7 @@ class Compensator:
                 "compensator outside", f"'{outside}' is unknown", "use clamp or refuse"
             )
         self.error_map, self.method, self.outside = error_map, method, outside
-        self._is_fitted = fitted == method
+        self._not_fitted = float(fitted != method)
         self._pitch = error_map.artifact.grid_pitch_m
         fields = np.stack([error_map.gx, error_map.gy])
         if method == "bicubic" and not np.isfinite(fields).all():
@@ -262,33 +271,31 @@ class Compensator:
     @cached_property
     def halfway(self) -> np.ndarray:
         """The error of interpolation halfway between sites, rms, m: [of Gx, Gy; along x, y]."""
-        emap = self.error_map
-        cubic = self.method == "bicubic"
-        if self._is_fitted:
-            return np.zeros((2, 2))
-        return np.array(
-            [
-                [
-                    error_halfway(
-                        np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0), cubic=cubic
-                    )[0]
-                    for axis in (0, 1)
-                ]
-                for g, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
-            ]
-        )
+        error = partial(error_halfway, cubic=self.method == "bicubic")
+        return self._not_fitted * along_axes(error, self.error_map)[..., 0]
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """What it has more in the outermost cells, m: [of Gx, Gy; along x, y; first, last cell]."""
+        return self._not_fitted * along_axes(error_at_edges, self.error_map)
 
     def _between(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return the standard uncertainty of the interpolation of Gx and Gy, (2, ...), m."""
-        shares = []
-        for p, half in zip(
-            np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half, strict=True
+        sizes = np.concatenate([self.halfway[..., None], self.edges], axis=2) ** 2
+        square = 0.0
+        for axis, (p, half) in enumerate(
+            zip(
+                np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half, strict=True
+            )
         ):
             at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
-            shares.append(
-                share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at))
-            )
-        return np.sqrt(np.tensordot(self.halfway**2, np.stack(shares) ** 2, axes=1))
+            at = np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)
+            first = np.minimum(np.floor(at), 2 * half - 1)
+            away = np.stack([0 * first, first, 2 * half - 1 - first])
+            passed_on = PASSED_ON[self.method] ** (2 * away)
+            in_cell = np.tensordot(sizes[:, axis], passed_on, axes=1)
+            square = square + in_cell * share_between(at) ** 2
+        return np.sqrt(square)
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return Gtheta = indicated - true, rad, at true angles; any number of turns.

@@ -9,6 +9,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import (
     CELL_MEAN,
     ErrorMap,
+    error_at_edges,
     error_halfway,
     share_between,
 )
@@ -65,6 +66,67 @@ def shares_in_u(size, pitches, method):
 @pytest.mark.parametrize(("size", "pitches"), [(9, 5), (11, 4), (11, 8)])
 def test_the_stage_is_within_u_between_the_nodes(size, pitches, method):
     assert shares_in_u(size, pitches, method).mean() > 0.94
+
+
+def edge_departures(size, pitches, rise_m, begins, noise_m=NOISE_M, runs=20):
+    """Return shares in 2 u of the three cells at the last column, and the sizes at all edges.
+
+    Gx rises there as the square, from `begins` pitches before the column on.
+    """
+    artifact, shares, edges = Artifact(size, PITCH_M), [], []
+    last = artifact.half[0] * PITCH_M
+    for seed in range(runs):
+        rng, smooth = np.random.default_rng([seed, 2]), stage(seed, pitches)
+
+        def error(x, y, smooth=smooth):
+            inside, gy = smooth(x, y)
+            beyond = np.maximum(x - last + begins * PITCH_M, 0) / (begins * PITCH_M)
+            return inside + rise_m * beyond**2, gy
+
+        u = np.full(artifact.shape, noise_m)
+        g = [
+            part + rng.normal(0, noise_m, artifact.shape)
+            for part in error(artifact.x_m, artifact.y_m)
+        ]
+        used = Compensator(
+            ErrorMap(artifact, *g, u, u, np.zeros(0), np.zeros(0)), method="bicubic"
+        )
+        x = last - (np.arange(3)[:, None] + rng.uniform(0, 1, (3, 100))) * PITCH_M
+        y = rng.uniform(-1, 1, (3, 100)) * artifact.half[1] * PITCH_M
+        missed = np.abs(used.error(x, y)[0] - error(x, y)[0])
+        shares.append(np.mean(missed <= 2 * used.uncertainty(x, y)[0], axis=1))
+        edges.append(used.edges)
+    return np.mean(shares, axis=0), np.array(edges)
+
+
+@pytest.mark.parametrize("begins", [0.4, 0.5, 1.0])
+@pytest.mark.parametrize(("size", "rise_m"), [(6, 3e-6), (7, 1e-6), (11, 5e-6)])
+def test_an_error_that_begins_within_the_last_cell_is_within_u(size, rise_m, begins):
+    """Without a size of the edge's own it was 2 to 40 % there, and the spline's echo next to it."""
+    shares, edges = edge_departures(size, 14, rise_m, begins)
+    assert (shares > 0.95).all()
+    assert edges[:, 0, 0, 1] == pytest.approx(rise_m / 2, rel=0.2)
+    edges[:, 0, 0, 1] = 0
+    assert not edges.any()
+
+
+@pytest.mark.parametrize("noise_m", [1e-9, 3e-8, 3e-7])
+@pytest.mark.parametrize(("size", "pitches"), [(5, 5), (6, 5), (7, 4), (9, 8), (13, 4)])
+def test_the_edges_of_smooth_stages_have_no_size_of_their_own(size, pitches, noise_m):
+    _, edges = edge_departures(size, pitches, 0.0, 0.5, noise_m, runs=40)
+    assert not edges.any()
+
+
+def test_an_edge_is_told_from_its_known_nodes_and_another_axis_is_not_asked():
+    values = np.zeros((7, 5))
+    values[0] = [np.nan, 3e-7, np.nan, 4e-7, np.nan]
+    u = np.full(values.shape, 1e-9)
+    assert error_at_edges(values, u) == pytest.approx(
+        [np.sqrt(12.5) * 0.5e-7, 0], rel=1e-3
+    )
+    assert not error_at_edges(values[:5], u[:5]).any()  # one row inside tells nothing
+    assert not error_at_edges(np.full((7, 5), np.nan), u).any()
+    assert not error_at_edges(np.moveaxis(values, 0, 1), u.T).any()
 
 
 def test_a_bicubic_map_of_a_smooth_stage_is_worth_more_between_the_nodes():

@@ -8,6 +8,7 @@ comparisons of maps and budgets use. The budget lists labelled components as the
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,14 @@ from selfcal_ros.model.budget import (
     OfReference,
     OfTerm,
 )
-from selfcal_ros.model.error_map import CELL_MEAN, ErrorMap, error_halfway, rms
+from selfcal_ros.model.error_map import (
+    CELL_MEAN,
+    ErrorMap,
+    along_axes,
+    error_at_edges,
+    error_halfway,
+    rms,
+)
 from selfcal_ros.model.kept import NOISE, rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.reference import ReferenceLength
@@ -544,19 +552,15 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     is_spline = all_known and result.interpolation == Interpolation.BICUBIC
     if (is_linear or is_spline) and result.reads_between_nodes:
         return _interpolation("xy", 0.0, 0.0)
-    errors = [
-        [
-            error_halfway(
-                np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0), cubic=is_spline
-            )
-            for axis in (0, 1)
-        ]
-        for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
-    ]
+    errors = along_axes(partial(error_halfway, cubic=is_spline), emap) ** 2
+    edges = along_axes(error_at_edges, emap) ** 2
+    cells = np.array(emap.valid.shape) - 1
+    mean = errors[..., 0] + edges.sum(axis=2) / cells
+    largest = errors[..., 1] + edges.max(axis=2)
     return _interpolation(
         "xy",
-        np.sqrt(np.mean([x[0] ** 2 + y[0] ** 2 for x, y in errors])),
-        max(np.hypot(x[1], y[1]) for x, y in errors),
+        float(np.sqrt(mean.sum(axis=1).mean())),
+        float(np.sqrt(largest.sum(axis=1).max())),
     )
 
 

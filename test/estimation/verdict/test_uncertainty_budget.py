@@ -15,7 +15,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.budget import OfNoise
-from selfcal_ros.model.error_map import first_order
+from selfcal_ros.model.error_map import CELL_MEAN, first_order
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
@@ -238,6 +238,24 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one(monkeypatch):
     monkeypatch.setattr(CalibrationResult, "reads_between_nodes", True)
     part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
     assert part.effect_max == part.effect_rms == 0
+
+
+def test_an_edge_of_its_own_is_in_the_budget_anywhere_once_in_eight_cells():
+    result, nothing = calibrated(), np.zeros(ARTIFACT.shape)
+    smooth = replace(
+        result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing
+    )
+    rising = replace(smooth, gx=np.where(ARTIFACT.m == ARTIFACT.m.max(), 4e-7, 0.0))
+    without, found = (
+        parts_of(drawn_up(result, error_map=emap)[1])["interpolation"]
+        for emap in (smooth, rising)
+    )
+    assert without.effect_max == 0
+    used = Compensator(rising)
+    squares = used.halfway[0, 0] ** 2 + used.edges[0, 0, 1] ** 2 / 8
+    assert used.edges[0, 0, 1] == pytest.approx(2e-7)
+    assert found.effect_rms == pytest.approx(np.sqrt(CELL_MEAN / 2 * squares))
+    assert found.effect_max > 2e-7
 
 
 def test_a_spline_with_an_unknown_node_has_the_error_of_the_linear_map_that_is_used(
