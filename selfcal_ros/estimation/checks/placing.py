@@ -45,6 +45,9 @@ BETTER = 30.0
 """Gain of the log-likelihood above which another pose is accepted."""
 CLEARLY = 10.0
 """Required gain over the second best pose."""
+ROUGHER = (1 / 2, 1 / 4)
+"""Parts of the distance of a map's nodes over which a stage may change that is too rough for it:
+plates that lie as planned contradict each other then, too."""
 LEFT = 0.05
 """Part of the plan's mean square which another pose may leave: there may be other faults too."""
 SAME_MARK = 0.1
@@ -152,11 +155,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if not spread > max(2 * noise, LEAST_NOISE_M):
         return None
     grid = artifact.map_grid
-    sizes = (
-        max(noise, spread / 1000),
-        spread,
-        _alike(views, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0),
-    )
+    nodes = grid.pitch_m / artifact.grid_pitch_m if grid else 0.0
+    sizes = (max(noise, spread / 1000), spread, _alike(views, nodes))
     as_planned = _FactoredReadings(views, [], *sizes)
     planned, square = as_planned.with_moved([])
     if square < EXPLAINED:
@@ -181,8 +181,14 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
             )
             tried.append((likelihood - planned, mean_square, view, readings.pose, pose))
     tried.sort(key=lambda item: -item[0])
-    of_outliers = as_planned.gain_without_outliers()
-    best = max(tried[0][0] if tried else 0.0, of_outliers)
+    otherwise = max(
+        as_planned.gain_without_outliers(),
+        *(
+            _likelihood(views, *sizes[:2], _alike(views, nodes * part))[0] - planned
+            for part in ROUGHER
+        ),
+    )
+    best = max(tried[0][0] if tried else 0.0, otherwise)
     enough = max(CONTRADICTED, LEFT * square)
     if mirrored := _mirrored(
         views, planned, sizes, max(best + CLEARLY, BETTER), enough
@@ -191,7 +197,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if not tried:
         return None
     gain, mean_square, view, planned_pose, pose = tried[0]
-    second = max(tried[1][0] if len(tried) > 1 else 0.0, of_outliers)
+    second = max(tried[1][0] if len(tried) > 1 else 0.0, otherwise)
     if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
     return Misplaced.of(view.plan_view, planned_pose, pose)

@@ -14,10 +14,11 @@ from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, subset
+from test.support import placed
 from test.support.collecting import collect, gathered, scene
 from test.support.mark_lists import lattice, rings, scatter
 from test.support.misplaced import NOISE, laid, laid_at
-from test.support.placed import SIX, plate
+from test.support.placed import PITCH_M, SIX, plate
 from test.support.plans import image_plan, plan_of
 from test.support.truth import random_truth, simulate_measurements
 
@@ -288,6 +289,36 @@ def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
 def test_plates_off_the_lattice_that_lie_as_planned_are_no_finding(name, sigma):
     for seed in range(2):
         assert misplaced(laid_at(PLATES[name], 1, SIX[1], seed, sigma)) is None
+
+
+SIX_TURNS = (
+    (0, (0, 0)),
+    (30, (0, 0)),
+    (45, (0.3, -0.2)),
+    (137, (0, 0)),
+    (90, (-0.7, 0.4)),
+    (0, (0.5, 0.37)),
+)
+
+
+@pytest.mark.parametrize("pitches", [3, 4])
+def test_a_stage_too_rough_for_its_nodes_is_no_mirrored_frame(pitches):
+    """Waves of about the nodes' distance: plates that lie as planned contradict each other."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        along = (
+            np.exp(1j * rng.uniform(0, 2 * np.pi, 6)) * 2 * np.pi / pitches / PITCH_M
+        )
+        phases = rng.uniform(0, 2 * np.pi, (2, 6, 1))
+
+        def rough(z, along=along, phases=phases):
+            wave = np.real(np.ravel(z) * along.conj()[:, None])
+            x, y = 1.2e-7 * np.cos(wave + phases).sum(axis=1)
+            return (x + 1j * y).reshape(np.shape(z))
+
+        found, _ = placed.readings(plate(7, 3), SIX_TURNS, rng, size=3e-7, stage=rough)
+        views = [replace(view, sigma_xy=20e-9, dof_xy=50) for view in found.views]
+        assert misplaced(replace(found, views=tuple(views))) is None
 
 
 def reflected(events, of):
