@@ -12,7 +12,12 @@ from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.error_map import (
+    ErrorMap,
+    ThetaDatum,
+    along_axes,
+    error_at_edges,
+)
 from selfcal_ros.model.findings import ViewLeftOut
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import CalibrationResult, ViewResult
@@ -325,6 +330,7 @@ def error_section(result: CalibrationResult) -> Section:
             (result.noise.k_xy, result.noise.dof_of("xy")),
         ),
         *_between_nodes(result),
+        *_edges(result),
         (
             "non-orthogonality",
             _slope_text(
@@ -362,6 +368,30 @@ def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
         for budget in result_budgets
         if budget.quantity == "xy" and budget.anywhere
     ]
+
+
+def _edges(result: CalibrationResult) -> list[tuple[str, str]]:
+    """Return the outermost rows of nodes that depart from the course of those inside."""
+    emap = result.error_map
+    if result.reads_between_nodes:
+        return []
+    artifact, facts = emap.artifact, []
+    edges = along_axes(error_at_edges, emap)
+    for of, axis, side in zip(*edges.nonzero(), strict=True):
+        last = (2 * side - 1) * artifact.half[axis]
+        next_to_last, at = (
+            f"{place * artifact.grid_pitch_m * MM_PER_M:.6g}"
+            for place in (last - np.sign(last), last)
+        )
+        facts.append(
+            (
+                f"edge {'xy'[axis]} {at} mm",
+                f"G{'xy'[of]} departs by {um(2 * edges[of, axis, side])} from its course inside: "
+                f"U is as large between {'xy'[axis]} {next_to_last} and {at} mm; let the field "
+                "end where the stage runs freely",
+            )
+        )
+    return facts
 
 
 def _first_order_u(result: CalibrationResult) -> tuple[float, float]:

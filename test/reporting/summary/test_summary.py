@@ -159,6 +159,20 @@ def test_numbers_of_a_map_by_hand():
     )
 
 
+def test_a_row_at_an_edge_that_departs_from_those_inside_is_named():
+    emap = random_map(Artifact(9, 0.01), 1)
+    flat = np.zeros(emap.artifact.shape)
+    rising = flat.copy()
+    rising[:, 0] = 3e-6
+    emap = replace(emap, gx=flat, gy=rising, u_gx=flat + 1e-9, u_gy=flat + 1e-9)
+    result = replace(known_result(9, 0)[0], error_map=emap)
+    text = summary_text(result)
+    assert "Gy departs by 3.00 µm" in line_with(text, "edge y -40 mm")
+    assert "between y -30 and -40 mm" in text and text.count("departs") == 1
+    quiet = replace(result, error_map=replace(emap, gy=flat))
+    assert "departs" not in summary_text(quiet)
+
+
 def test_unknown_sites_do_not_count():
     gx = np.array([[np.nan, 1e-6, 0], [0, 9e-6, 0], [0, 0, 0]])
     gy = np.array([[1e-3, 0, 0], [0, np.nan, 0], [0, 0, 0]])
