@@ -116,7 +116,8 @@ class MonitorSession(Guarded):
             if not word:
                 self._end()
             elif word not in self._askers:
-                self._answer(f"{word}: not known", success=False)
+                known = ", ".join([*REQUESTS, "quit"])
+                self._answer(f"{word}: is unknown; give {known}", success=False)
             else:
                 self._asked.append((word, time.monotonic() + PATIENCE_S, None))
         waiting = []

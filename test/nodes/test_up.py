@@ -286,8 +286,8 @@ def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     assert given[-2:] == ["-p", f"result_folder:={tmp_path}"]
 
 
-def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
-    monkeypatch.setattr(monitor_session.sys, "stdin", io.StringIO("start\n"))
+def test_a_request_without_a_cell_and_an_unknown_one_say_so(graph, monkeypatch, capsys):
+    monkeypatch.setattr(monitor_session.sys, "stdin", io.StringIO("go\nstart\n"))
     monkeypatch.setattr(monitor_session, "PATIENCE_S", 0.0)
     graph.add(monitor_session.MonitorSession("", context=graph.context))
     said: list = []
@@ -296,13 +296,17 @@ def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
         said.extend(map(json.loads, capsys.readouterr().out.splitlines()))
         return [line for line in said if "answer" in line]
 
-    graph.until(answers, "the answer")
+    graph.until(lambda: len(answers()) == 2, "the answers")
     assert answers() == [
+        {
+            "success": False,
+            "answer": "go: is unknown; give start, confirm, redo, skip, abort, quit",
+        },
         {
             "success": False,
             "answer": "start: pose_sequencer does not answer; is "
             "it running in this namespace and ROS_DOMAIN_ID?",
-        }
+        },
     ]
 
 
