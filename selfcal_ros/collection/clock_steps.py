@@ -15,7 +15,7 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 GROUP, BESIDE = 5, 3
-"""Messages per group, and groups compared on either side of a step."""
+"""Messages per group, those of one stamp as one, and groups compared on each side of a step."""
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
 REMEDY = (
@@ -59,6 +59,7 @@ class StepWatch:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_ns = round(limit_s * NS_PER_S)
+        self._last_ns = np.zeros(1, dtype=np.int64)  # the newest stamp
         self._rest = np.zeros((2, 0), dtype=np.int64)  # an incomplete group
         self._groups = np.zeros((6, 0), dtype=np.int64)
         self._nearest: tuple[int, int] | None = None  # largest offset, and its time
@@ -72,8 +73,11 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
+        # the marks of an image tell of one exposure
+        first = np.diff(stamps_ns, prepend=self._last_ns) != 0
+        self._last_ns = np.append(self._last_ns, stamps_ns)[-1:]
         messages = np.concatenate(
-            [self._rest, np.stack([stamps_ns, received_ns])], axis=1
+            [self._rest, np.stack([stamps_ns, received_ns])[:, first]], axis=1
         )
         n_grouped = messages.shape[1] // GROUP * GROUP
         self._rest = messages[:, n_grouped:]
@@ -119,7 +123,8 @@ class StepWatch:
                 self._quiet -= 1
                 continue
             nearest, when = self._nearest_so_far(before[1][:, number])
-            ahead = offset[number] > nearest + self._limit_ns // 2
+            # by at least half of it: the rest may be a delay that ended
+            ahead = offset[number] - nearest > max(self._limit_ns, size[number]) // 2
             if size[number] < 0 or (size[number] and ahead):
                 # of the groups affected, the middle one contains the step
                 last = min(number + BESIDE, count)

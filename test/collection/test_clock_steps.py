@@ -147,6 +147,20 @@ def sent_again(number=60):
     )
 
 
+def backlog():
+    """A detector that begins 0.18 s late and falls behind by 2 s rests for 3 s, and is warm."""
+    number = np.arange(len(TRUE))
+    stamps = TRUE + np.where(number >= 1000, 3 * S, 0)
+    late = np.where(number < 1000, 180 * MS + number * 2 * MS, 100 * MS)
+    return stamps, stamps + late
+
+
+def cold():
+    """Images of 25 marks every 2 s; the detector takes a second for the first one."""
+    stamps = np.repeat(TRUE[0] + np.arange(60) * 2 * S, 25)
+    return stamps, stamps + np.where(np.arange(len(stamps)) < 25, S, 20 * MS)
+
+
 @pytest.mark.parametrize(
     "case",
     [
@@ -158,6 +172,8 @@ def sent_again(number=60):
         mixed,
         faster,
         sent_again,
+        backlog,
+        cold,
         late_then_dropped,
         late_for_long,
     ],
