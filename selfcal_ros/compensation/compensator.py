@@ -288,13 +288,13 @@ class Compensator:
                 np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half, strict=True
             )
         ):
+            cells = np.arange(2 * half)
+            away = np.stack([0 * cells, cells, cells[::-1]])
+            in_cells = sizes[:, axis] @ PASSED_ON[self.method] ** (2 * away)
             at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
             at = np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)
-            first = np.minimum(np.floor(at), 2 * half - 1)
-            away = np.stack([0 * first, first, 2 * half - 1 - first])
-            passed_on = PASSED_ON[self.method] ** (2 * away)
-            in_cell = np.tensordot(sizes[:, axis], passed_on, axes=1)
-            square = square + in_cell * share_between(at) ** 2
+            cell = np.minimum(np.nan_to_num(at), cells[-1]).astype(int)
+            square = square + in_cells[:, cell] * share_between(at) ** 2
         return np.sqrt(square)
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
