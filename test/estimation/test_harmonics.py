@@ -471,9 +471,9 @@ def test_a_recheck_of_a_known_plate_finds_the_series():
 
     def found(weight):
         effects = Effects.of(
-            np.repeat("known plate", count),
             np.ones(count),
-            np.zeros(count),
+            np.arange(count),
+            plate=np.zeros(count),
             before=np.zeros((2 * count, 2 * count)),
             length=np.zeros(count),
         )

@@ -10,6 +10,7 @@ give the probability of the most telling of the three; every other one tells how
 found.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -188,6 +189,10 @@ def statistics(changes: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack([all_axes, (at_nodes**3).sum(axis=0), smooth])
 
 
+NO_SCALE = ScaleChange(False, math.nan, math.nan, math.nan)
+"""Change of the scale of a map that has none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Change:
     """Change of a map: new minus old, without motion, and without scale where none is known.
@@ -200,8 +205,8 @@ class Change:
         Its significance.
     p : float
         Probability of as large a change if there is none.
-    scale, u_scale, p_scale : float
-        Change of the scale against the plate, m/m.
+    scale : ScaleChange
+        Of the XY map.
     tests : ChangeTests or None
         Tests of the XY map.
     """
@@ -210,9 +215,7 @@ class Change:
     u: np.ndarray
     test: Significance | None
     p: float = 1.0
-    scale: float = float("nan")
-    u_scale: float = float("nan")
-    p_scale: float = float("nan")
+    scale: ScaleChange = NO_SCALE
     tests: ChangeTests | None = None
 
     @property
@@ -238,6 +241,7 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     row = scale_row(modes)
     scale = float(row @ values)
     u_scale = float(np.sqrt(row @ covariance @ row))
+    p_scale = 2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale))
 
     out = np.full((2, len(common)), np.nan)
     out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
@@ -247,9 +251,7 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
         u=u,
         test=test,
         p=1.0 if test is None else tests.p(in_datum),
-        scale=scale,
-        u_scale=u_scale,
-        p_scale=2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
+        scale=ScaleChange(p_scale < USUAL_LEVEL, scale, u_scale, p_scale),
         tests=None if test is None else tests,
     )
 
@@ -426,9 +428,6 @@ def recheck_found(
     )
     tested = [of_map.p for of_map in (change, lines) if of_map.test is not None]
     p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
-    scale = ScaleChange(
-        change.p_scale < USUAL_LEVEL, change.scale, change.u_scale, change.p_scale
-    )
     (dx, dy), (u_dx, u_dy) = change.values, change.u
     outcome = Recheck(
         of=plate.where,
@@ -440,7 +439,7 @@ def recheck_found(
         u_rms=rms(change.u),
         p_xy=change.p,
         significance_xy=change.test,
-        scale=scale,
+        scale=change.scale,
         dx=dx,
         dy=dy,
         u_dx=u_dx,

@@ -65,9 +65,11 @@ from selfcal_ros.estimation.recheck.views import (
     TEMPERATURE,
     TERMS,
     Effects,
+    Estimate,
     NewMap,
-    PlateReadings,
-    PlateSolution,
+    dof_of_residuals,
+    estimate_of_marks,
+    known_nodes,
     map_of_lines,
     map_of_marks,
     solve_marks,
@@ -95,7 +97,7 @@ from selfcal_ros.model.findings import (
     ScaleChanged,
 )
 from selfcal_ros.model.kept import SlowKept
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
@@ -113,10 +115,14 @@ class Rechecked:
         Views of the plate, with the nodes of its map.
     plate : KnownPlate
         The plate.
-    readings : PlateReadings
-        The readings.
-    solution : PlateSolution
-        The solution of the marks, frame of the equations.
+    problem : Problem
+        The readings in the frame of the plate as placed.
+    columns : TermColumns
+        Effects on those of marks, and terms of lines.
+    parameters : float array (size,)
+        Misalignments as in `NormalEquations`, m.
+    square : float
+        Sum of squares of the residuals of marks, in units of their covariance.
     new, lines : NewMap
         Both maps.
     xy, theta : NoiseEstimate
@@ -127,8 +133,10 @@ class Rechecked:
 
     measurements: Measurements
     plate: KnownPlate
-    readings: PlateReadings
-    solution: PlateSolution
+    problem: Problem
+    columns: TermColumns
+    parameters: np.ndarray
+    square: float
     new: NewMap
     lines: NewMap
     xy: NoiseEstimate
@@ -205,23 +213,19 @@ def recheck_of(
         )
     images = _images(measurements, problem, plate)
     xy, theta = _noise(images, problem, plate)
-    readings = _readings(
-        measurements,
-        problem,
-        options,
-        plate=plate,
-        sigma=xy.sigma,
-        images=images,
-        microscope=microscope,
+    columns, estimate = _estimate(
+        problem, options, plate, sigma=xy.sigma, images=images, microscope=microscope
     )
-    solution = solve_marks(readings)
+    field, parameters, square = solve_marks(problem, columns, estimate)
     return Rechecked(
         measurements=measurements,
         plate=plate,
-        readings=readings,
-        solution=solution,
-        new=map_of_marks(readings, solution, xy.dof),
-        lines=_new_lines(readings, plate, theta),
+        problem=problem,
+        columns=columns,
+        parameters=parameters,
+        square=square,
+        new=map_of_marks(problem, estimate, field, measurements.sense, xy.dof),
+        lines=_new_lines(problem, columns, plate, measurements.sense, theta),
         xy=xy,
         theta=theta,
         microscope=microscope,
@@ -250,7 +254,7 @@ def recheck(
         (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
-    problem = solved.readings.problem
+    problem = solved.problem
     outcome = recheck_found(
         map_change(solved.new, solved.artifact, plate),
         line_change(solved.lines, plate),
@@ -265,9 +269,7 @@ def recheck(
         "xy": np.sum(list(solved.covariances.values()), axis=0),
         "theta": solved.of_lines,
     }
-    unknowns = (
-        2 * int(solved.readings.known.sum()) + problem.system.grid.n_misalignments
-    )
+    unknowns = 2 * int(known_nodes(problem).sum()) + problem.system.grid.n_misalignments
     terms = tuple(
         TermResult(
             str(term.name),
@@ -282,7 +284,7 @@ def recheck(
         plan_id=measurements.plan_id,
         error_map=solved.error_map(),
         artifact_map=plate.result.artifact_map,
-        views=views_of(measurements, problem, solved.solution.parameters),
+        views=views_of(measurements, problem, solved.parameters),
         observability=Observability(unknowns, unknowns, 0, True),
         noise=_with_coverage(
             noise_of(solved.xy, solved.theta), solved.variances, plate
@@ -329,7 +331,7 @@ def _failed(
         images = solved.plate.result.kept.images
         if images is not None and solved.measurements.has_images:
             dof_noise = images.dof_mark
-        failed = _misfit(solved.solution.square, solved.readings.dof, dof_noise)
+        failed = _misfit(solved.square, dof_of_residuals(solved.problem), dof_noise)
     if not changes:
         return failed
     if not failed:
@@ -383,7 +385,7 @@ def _scale_changes(outcome: Recheck) -> Iterator[ScaleChanged]:
 def _off(solved: Rechecked) -> Iterator[Finding]:
     """Yield a finding if visits show another microscope than is assumed."""
     term = next(
-        (term for term in solved.readings.problem.terms if term.block.of_microscope),
+        (term for term in solved.problem.terms if term.block.of_microscope),
         None,
     )
     if solved.microscope is None or term is None:
@@ -414,16 +416,14 @@ def _by_microscope(
     tells them: then nothing of the change of XY is left beyond its uncertainty, and they differ
     from what was assumed. Lines have not changed.
     """
-    readings = solved.readings
     block = block_of_offsets()
-    columns = readings.columns.columns
     rows = [
         row
-        for row, column in enumerate(columns)
+        for row, column in enumerate(solved.columns.columns)
         if column.term == block.name and column.component in SIMILAR
     ]
     of_lines = outcome.p_theta is not None and 2 * outcome.p_theta < USUAL_LEVEL
-    if not rows or of_lines or readings.shows_microscope:
+    if not rows or of_lines or solved.microscope is not None:
         return
     explained_by = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
     if (
@@ -431,7 +431,7 @@ def _by_microscope(
         or explained_by.p_none >= USUAL_LEVEL
     ):
         return
-    scale, turn = readings.effects.mean[rows] + explained_by.values
+    scale, turn = solved.new.effects.mean[rows] + explained_by.values
     u_scale, u_turn = explained_by.u
     yield ChangedOrMicroscope(
         **vars(changed),
@@ -506,7 +506,12 @@ def _images(
     share = share_of(plate.result)
     motion = (kept and kept.motion) or SlowKept(1 - share, share, 0.0)
     total = motion.white + motion.slow
-    stop = _stops(measurements, problem)
+    read = problem.system.grid.read
+    seen = [measurements.views[index].view for index in problem.grid.index]
+    cells = cells_seen(measurements.artifact, seen)
+    stop = np.full(read.shape, -1)
+    if cells is not None:
+        stop[read] = stops_of(cells, read)
     slow = motion.slow / total if total else 0.0
     of_reading *= _identical(problem.repeats_xy, problem.grid.weight)
     return StopsOfImages(
@@ -517,77 +522,94 @@ def _images(
     )
 
 
-def _readings(
-    measurements: Measurements,
+def _estimate(
     problem: Problem,
     options: Options,
-    *,
     plate: KnownPlate,
+    *,
     sigma: float,
     images: StopsOfImages | None,
     microscope: "SeenMicroscope | None",
-) -> PlateReadings:
-    """Return the readings with what has an effect on them, for the noise of one reading, m.
+) -> tuple[TermColumns, Estimate]:
+    """Return the effects on marks with a noise of one reading, m, and the least squares with them.
 
     The noise of a mark in images is the calibration's, and not none: the readings have to be
     weighted.
     """
     _require_noise(sigma)
     variance = sigma**2
-    stop = _stops(measurements, problem) if images is None else images.stop
+    read = problem.system.grid.read
+    marks = read.any(axis=0)
+    of_each = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape)
+    shapes = {PLATE: of_each * read}
     if images is not None:
         variance = float(np.clip(images.mark, TRACE * sigma**2, sigma**2))
-    read = problem.system.grid.read
-    sites = plate.together.sites
-    marks = read.any(axis=0)
-    of_mark = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape) * read
-    of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
-        (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0)
+        weight = np.where(read, problem.grid.weight, 1.0)
+        stops = np.arange(images.stop.max() + 1)[:, None, None, None]
+        shapes[NOISE] = (images.stop == stops) * np.sqrt((sigma**2 - variance) / weight)
+    columns = _columns(problem, shapes)
+    effects = _effects(
+        columns, marks, options, plate, images=images, microscope=microscope
     )
-    columns = _columns(problem, of_mark, of_stop)
-    offsets = plate.of_offsets
-    declared = any(term.block.of_microscope for term in options.terms)
+    return columns, estimate_of_marks(problem, columns.shapes, effects, variance)
+
+
+def _columns(problem: Problem, shapes: dict[str, np.ndarray]) -> TermColumns:
+    """Return the columns of shapes, (n, views, nx, ny), along x, then y, and of terms.
+
+    The latter for offsets as they were seen.
+    """
+    builder = ColumnBuilder(
+        without_noise(problem.inputs, np.zeros(problem.grid.y.shape))
+    )
+    for name, values in shapes.items():
+        numbers = [
+            builder.add(dict(enumerate(shape.reshape(len(shape), -1))))
+            for shape in values
+        ]
+        for axis, unit in AXES:
+            for number in numbers:
+                builder.column(Column(name, SHARED, axis, 1.0), number, unit)
+    builder.add_terms(problem.terms)
+    return builder.build()
+
+
+def _effects(
+    columns: TermColumns,
+    marks: np.ndarray,
+    options: Options,
+    plate: KnownPlate,
+    *,
+    images: StopsOfImages | None,
+    microscope: "SeenMicroscope | None",
+) -> Effects:
+    """Return what is known of the effects on marks, bool (nx, ny), that were read.
+
+    By the calibration, of images, and of the microscope by visits.
+    """
+    noise = columns.rows([NOISE])
     of_microscope = columns.having(lambda block: block.of_microscope)
-    known_offsets = of_microscope & (
-        np.isfinite(offsets).all() and not declared and microscope is None
-    )
-    components = np.array(
-        [
-            MICROSCOPE_PARTS.index(columns.columns[column].component)
-            for column in np.flatnonzero(known_offsets)
-        ],
-        dtype=int,
-    )
-    source = np.where(
-        columns.rows([PLATE]) | known_offsets,
-        PLATE,
-        np.where(columns.rows([NOISE]), NOISE, TERMS),
-    )
-    start = 2 * int(sites.sum())
-    end = 2 * int(sites.sum() + marks.sum())
-    of_plate_and_offsets = np.append(np.arange(end), end + components)
-    before = plate.together.cover(sites, marks)[
-        np.ix_(of_plate_and_offsets, of_plate_and_offsets)
-    ]
-    now = plate.field[marks]
-    effects = Effects.of(
-        source,
-        columns.size,
-        np.concatenate([now.real, now.imag, offsets[components]]),
-        before=before,
-        length=plate.length_at(marks)[of_plate_and_offsets[start:] - start],
-    )
+    others = []
     if images is not None:
-        effects = effects.with_noise(images.of_stops.covariance)
+        others.append((noise, np.kron(np.eye(2), images.of_stops.covariance)))
     if microscope is not None:
-        effects = effects.known_as(of_microscope, microscope.covariance)
-    return PlateReadings(
-        problem,
-        measurements.sense,
-        columns,
-        effects,
-        variance,
-        shows_microscope=microscope is not None,
+        others.append((of_microscope, microscope.covariance))
+    at = np.where(columns.rows([PLATE]), np.arange(len(noise)), -1)
+    declared = any(term.block.of_microscope for term in options.terms)
+    if microscope is None and not declared and np.isfinite(plate.of_offsets).all():
+        at[of_microscope] = [
+            2 * marks.sum() + MICROSCOPE_PARTS.index(columns.columns[row].component)
+            for row in np.flatnonzero(of_microscope)
+        ]
+    now = plate.field[marks]
+    return Effects.of(
+        columns.size,
+        at,
+        plate=np.concatenate([now.real, now.imag, plate.of_offsets]),
+        before=plate.together.cover(plate.together.sites, marks),
+        length=plate.length_at(marks),
+        noise=noise,
+        others=others,
     )
 
 
@@ -693,39 +715,6 @@ def _require_noise(sigma: float) -> None:
         )
 
 
-def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> TermColumns:
-    """Return the columns of marks and of stops, (n, views, nx, ny), along x, then y, and of terms.
-
-    The latter for offsets as they were seen.
-    """
-    builder = ColumnBuilder(
-        without_noise(problem.inputs, np.zeros(problem.grid.y.shape))
-    )
-    for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
-        numbers = [
-            builder.add(dict(enumerate(shape.reshape(len(shape), -1))))
-            for shape in shapes
-        ]
-        for axis, unit in AXES:
-            for number in numbers:
-                builder.column(Column(name, SHARED, axis, 1.0), number, unit)
-    builder.add_terms(problem.terms)
-    return builder.build()
-
-
-def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
-    """Return the stop of the stage at which each mark was read, (views, nx, ny); -1 = none."""
-    read = problem.system.grid.read
-    out = np.full(read.shape, -1)
-    cells = cells_seen(
-        measurements.artifact,
-        [measurements.views[index].view for index in problem.grid.index],
-    )
-    if cells is not None:
-        out[read] = stops_of(cells, read)
-    return out
-
-
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     """Return the terms; views of a known plate do not determine those without a size."""
     terms = tuple(
@@ -791,10 +780,14 @@ def _noise(
 
 
 def _new_lines(
-    readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate
+    problem: Problem,
+    columns: TermColumns,
+    plate: KnownPlate,
+    sense: Sense,
+    theta: NoiseEstimate,
 ) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
-    angular, of_terms = readings.problem.angular, readings.columns.lines
+    angular, of_terms = problem.angular, columns.lines
     (_, known_lines), before = plate.together.lines()
     count = len(known_lines)
     lines = lines_of(
@@ -806,12 +799,11 @@ def _new_lines(
         _require_noise(theta.sigma)
     of_plate = np.broadcast_to(np.eye(count)[:, None], (count, *angular.weight.shape))
     values = np.concatenate([of_plate, *of_terms.values[:, None]])
-    size = np.append(np.ones(count), readings.columns.size[of_terms.at])
-    source = np.where(np.arange(len(size)) < count, PLATE, TERMS)
+    size = np.append(np.ones(count), columns.size[of_terms.at])
     effects = Effects.of(
-        source,
         size,
-        np.nan_to_num(plate.result.artifact_map.a_theta),
+        np.where(np.arange(len(size)) < count, np.arange(len(size)), -1),
+        plate=np.nan_to_num(plate.result.artifact_map.a_theta),
         before=before,
         length=np.zeros(count),
     )
@@ -820,7 +812,7 @@ def _new_lines(
         angular.y,
         LineColumns(np.arange(len(size)), values),
         effects,
-        sense=readings.sense,
+        sense=sense,
         noise=theta,
     )
 

@@ -6,6 +6,7 @@ place. How far off it may be is an effect on the readings as a term of the model
 each of its coordinates, with the covariance of the calibration in place of sizes.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,12 +14,12 @@ import numpy as np
 
 from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.comparison.covariance import unit_rows
-from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import placed
 from selfcal_ros.estimation.joint.problem import Moving, NoiseEstimate, Problem
 from selfcal_ros.estimation.normal.angular import FLOOR, GAP, MAX_STEPS, AngularSystem
+from selfcal_ros.estimation.normal.eliminated import PlateEliminated
 from selfcal_ros.estimation.normal.equations import pseudo_inverse
-from selfcal_ros.estimation.terms.columns import LineColumns, TermColumns
+from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
 from selfcal_ros.estimation.terms.equations import lines_eliminated, reduce_columns
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import Observability
@@ -37,17 +38,20 @@ class Effects:
     source : str array (p,)
         What each is: `PLATE`, what the calibration knows, `NOISE` that the marks of an image share,
         or `TERMS` of the model.
+    at : int array (p,)
+        Which of the k values that the calibration knows each is; -1 if it is none of them.
     mean : float array (p,)
         Their values.
     covariance : float array (p, p)
         Of these.
     before : float array (j + k, j + k)
-        Covariance of the earlier map, (j,), and of the k effects that the calibration knows.
+        Covariance of the earlier map, (j,), and of the k values.
     length : float array (k,)
         What a relative expansion of the plate of 1 makes of these.
     """
 
     source: np.ndarray
+    at: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
     before: np.ndarray
@@ -56,65 +60,34 @@ class Effects:
     @classmethod
     def of(
         cls,
-        source: np.ndarray,
         size: np.ndarray,
-        plate: np.ndarray,
+        at: np.ndarray,
         *,
+        plate: np.ndarray,
         before: np.ndarray,
         length: np.ndarray,
+        noise: np.ndarray | bool = False,
+        others: Iterable[tuple[np.ndarray, np.ndarray]] = (),
     ) -> "Effects":
-        """Return effects with sizes (p,), of which the calibration knows values `plate` (k,)."""
-        of_plate = source == PLATE
-        n_of_stage = len(before) - len(plate)
-        mean = np.zeros(len(size))
-        covariance = np.diag(size**2)
-        mean[of_plate] = plate
-        covariance[np.ix_(of_plate, of_plate)] = before[n_of_stage:, n_of_stage:]
-        return cls(source, mean, covariance, before, length)
+        """Return effects with sizes (p,), of which the calibration knows values `plate` (k,).
 
-    def known_as(self, rows: np.ndarray, covariance: np.ndarray) -> "Effects":
-        """Return the effects with those `rows`, bool (p,), known to be 0 by themselves."""
-        mean = np.where(rows, 0.0, self.mean)
-        all_known = self.covariance.copy()
-        all_known[rows], all_known[:, rows] = 0.0, 0.0
-        all_known[np.ix_(rows, rows)] = covariance
-        return replace(self, mean=mean, covariance=all_known)
-
-    def with_noise(self, covariance: np.ndarray) -> "Effects":
-        """Return the effects with a covariance, (n, n), of those of noise along each axis."""
-        of_noise = self.source == NOISE
-        everything = self.covariance.copy()
-        everything[np.ix_(of_noise, of_noise)] = np.kron(np.eye(2), covariance)
-        return replace(self, covariance=everything)
-
-    def projected(
-        self,
-        columns: tuple[np.ndarray, ...],
-        response: np.ndarray,
-        inverse: np.ndarray,
-        variance: float,
-    ) -> tuple[np.ndarray, ...]:
-        """Return what an estimate makes of a unit of each if it is not known, and what is left.
-
-        The map (nodes, p), the misalignments (size, p), and what an estimate of the effects leaves
-        of each, (p, p).
-
-        Parameters
-        ----------
-        columns : tuple of array (nodes, p), (size, p) and (p, p)
-            Their solution for known misalignments, right-hand side and inner products.
-        response, inverse : array (nodes, size) and (size, size)
-            Response of the map to the misalignments, and their covariance for unit noise.
-        variance : float
-            Of the noise of a reading.
+        Those that are `noise`, bool (p,), are of readings. `others` are known by themselves: rows,
+        bool (p,), and their covariance.
         """
-        free, right, gram = columns
-        misalignments = inverse @ right
-        information = (gram - right.T @ misalignments) / variance
-        return (
-            free - response @ misalignments,
-            misalignments,
-            np.linalg.inv(np.eye(len(gram)) + self.covariance @ information),
+        known = at >= 0
+        rows_of_plate = len(before) - len(plate) + at[known]
+        of_plate = before[np.ix_(rows_of_plate, rows_of_plate)]
+        mean, covariance = np.zeros(len(at)), np.diag(size**2)
+        mean[known] = plate[at[known]]
+        for rows, of_rows in ((known, of_plate), *others):
+            covariance[np.ix_(rows, rows)] = of_rows
+        return cls(
+            source=np.where(known, PLATE, np.where(noise, NOISE, TERMS)),
+            at=at,
+            mean=mean,
+            covariance=covariance,
+            before=before,
+            length=length,
         )
 
 
@@ -147,8 +120,11 @@ class NewMap:
 
     @property
     def from_plate(self) -> np.ndarray:
-        """What the effects that the calibration knows make of the map, (q, k)."""
-        return self.of_effects[:, self.effects.source == PLATE]
+        """What a unit of each value that the calibration knows makes of the map, (q, k)."""
+        known = self.effects.at >= 0
+        out = np.zeros((len(self.values), len(self.effects.length)))
+        out[:, self.effects.at[known]] = self.of_effects[:, known]
+        return out
 
     @property
     def from_length(self) -> np.ndarray:
@@ -197,95 +173,149 @@ class NewMap:
 
 
 @dataclass(frozen=True, eq=False)
-class PlateReadings:
-    """Readings of known marks and lines, and the effects on them.
+class Estimate:
+    """Least squares of readings of one kind of a known plate, with effects on them.
 
     Attributes
     ----------
-    problem : Problem
-        The readings in the frame of the plate as placed.
-    sense : Sense
-        What moves.
-    columns : TermColumns
-        Effects on those of marks, and terms of lines.
+    system : PlateEliminated
+        Their equations, of which no mark is eliminated.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit noise.
+    columns : tuple of array (sites, p), (size, p) and (p, p)
+        Those of the effects with the sites eliminated: their solution for known misalignments,
+        right-hand side and inner products.
+    against : callable
+        Returns the products of the columns with weighted residuals, (p,).
     effects : Effects
-        What is known of the former.
+        What is known of them.
     variance : float
-        Of the noise that each of those has by itself, m^2.
-    shows_microscope : bool
-        Whether visits of the same mark show the microscope, as check stops do.
+        Of the noise that each reading has by itself.
     """
 
-    problem: Problem
-    sense: Sense
-    columns: TermColumns
+    system: PlateEliminated
+    inverse: np.ndarray
+    columns: tuple[np.ndarray, np.ndarray, np.ndarray]
+    against: Callable[[np.ndarray], np.ndarray]
     effects: Effects
     variance: float
-    shows_microscope: bool
 
     @cached_property
-    def known(self) -> np.ndarray:
-        """Nodes of the map that the readings determine, frame of the equations, bool (nx, ny).
+    def misalignments(self) -> np.ndarray:
+        """Those that are found for a unit of each effect if that is not known, (size, p)."""
+        return self.inverse @ self.columns[1]
 
-        Raises
-        ------
-        NotIdentifiableError
-            If less than half of the nodes near the readings are.
+    @cached_property
+    def fields(self) -> np.ndarray:
+        """The map that is found for a unit of each effect if that is not known, (sites, p)."""
+        return self.columns[0] - self.system.response @ self.misalignments
+
+    @cached_property
+    def remaining(self) -> np.ndarray:
+        """What an estimate of the effects leaves of a unit of each, (p, p)."""
+        _, right, gram = self.columns
+        information = (gram - right.T @ self.misalignments) / self.variance
+        return np.linalg.inv(
+            np.eye(len(information)) + self.effects.covariance @ information
+        )
+
+    def solved(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return map and misalignments for readings less the known effects, in no datum.
+
+        And the sum of squares of the residuals in units of their covariance.
         """
-        system = self.problem.system
-        known_sites = system.known_sites
-        n = system.grid.n_sites
-        read = np.count_nonzero(system.grid.components.of_site >= 0)
-        if known_sites.sum() >= max(3, read / 2):
-            return known_sites
-        unknown = int((~known_sites).sum())
-        fewer = ", or give the map fewer nodes" * (placed(self.problem) is not None)
-        raise NotIdentifiableError(
-            f"a view of the known plate that leaves {unknown} of {n} nodes of the map "
-            f"unknown: measure more of its marks{fewer}",
-            Observability(2 * int(known_sites.sum()), 2 * n, 2 * unknown, False),
+        system = self.system
+        field, parameters = system.fitted(y, self.inverse)
+        residuals = system.plate(y, field, parameters)[1]
+        right = self.against(system.weight * residuals)
+        estimated = self.remaining @ (self.effects.covariance @ right) / self.variance
+        total = (system.weight * np.abs(residuals) ** 2).sum()
+        return (
+            field - self.fields @ estimated,
+            parameters - self.misalignments @ estimated,
+            float(total - estimated @ right) / self.variance,
         )
 
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of the residuals, the effects known."""
-        system = self.problem.system
-        on_map = placed(self.problem)
-        rank = (
-            system.rank_grid
-            if on_map is None
-            else (round(on_map.determined_coefficients) + on_map.rank_schur)
+    def new_map(
+        self, field: np.ndarray, rows: np.ndarray, known: np.ndarray, dof: float
+    ) -> NewMap:
+        """Return the map whose values are functionals, rows (sites, q), of a field (sites,).
+
+        `known` and `dof` are those of `NewMap`.
+        """
+        fields = np.real(rows.conj().T @ self.fields)
+        of_effects = fields @ self.remaining
+        sites, misalignments = self.system.functionals(rows, np.zeros(0))
+        of_noise = np.real(sites.conj().T @ self.system.solve(sites))
+        of_noise += misalignments.T @ self.inverse @ misalignments
+        by_estimate = of_effects @ self.effects.covariance @ (fields - of_effects).T
+        return NewMap(
+            known=known,
+            values=np.real(rows.conj().T @ field),
+            white=self.variance * of_noise + by_estimate,
+            of_effects=of_effects,
+            effects=self.effects,
+            dof=dof,
         )
-        return 2 * system.grid.n_readings - rank
 
 
-@dataclass(frozen=True, eq=False)
-class PlateSolution:
-    """The map of the stage in views of a known plate, frame of the equations.
+def known_nodes(problem: Problem) -> np.ndarray:
+    """Return the nodes of the map that readings determine, frame of the equations, bool (nx, ny).
 
-    Attributes
-    ----------
-    field : complex array (nodes,)
-        Error of the stage, no translation and rotation, m.
-    parameters : float array (3 views,)
-        Misalignments as in `NormalEquations`, m.
-    square : float
-        Sum of squares of the residuals, in units of their covariance.
-    fields : complex array (nodes, p)
-        Error of the stage that is found for a unit of each effect if that is not known.
-    remaining : float array (p, p)
-        What an estimate of the effects leaves of a unit of each.
+    Raises
+    ------
+    NotIdentifiableError
+        If less than half of the nodes near the readings are.
     """
+    system = problem.system
+    known_sites = system.known_sites
+    n = system.grid.n_sites
+    read = np.count_nonzero(system.grid.components.of_site >= 0)
+    if known_sites.sum() >= max(3, read / 2):
+        return known_sites
+    unknown = int((~known_sites).sum())
+    fewer = ", or give the map fewer nodes" * (placed(problem) is not None)
+    raise NotIdentifiableError(
+        f"a view of the known plate that leaves {unknown} of {n} nodes of the map "
+        f"unknown: measure more of its marks{fewer}",
+        Observability(2 * int(known_sites.sum()), 2 * n, 2 * unknown, False),
+    )
 
-    field: np.ndarray
-    parameters: np.ndarray
-    square: float
-    fields: np.ndarray
-    remaining: np.ndarray
+
+def dof_of_residuals(problem: Problem) -> int:
+    """Return the degrees of freedom of the residuals of marks, the effects known."""
+    system, on_map = problem.system, placed(problem)
+    rank = (
+        system.rank_grid
+        if on_map is None
+        else (round(on_map.determined_coefficients) + on_map.rank_schur)
+    )
+    return 2 * system.grid.n_readings - rank
 
 
-def solve_marks(readings: PlateReadings) -> PlateSolution:
-    """Return the map of the stage.
+def estimate_of_marks(
+    problem: Problem, shapes: Shapes, effects: Effects, variance: float
+) -> Estimate:
+    """Return the least squares of marks, each with noise of a variance, m^2, by itself."""
+    grid = problem.system.grid
+    columns = reduce_columns(grid, shapes)
+    return Estimate(
+        grid,
+        problem.system.grid_inverse,
+        (columns.free, columns.right, columns.gram),
+        lambda weighted: shapes.against(shapes.sums(weighted)),
+        effects,
+        variance,
+    )
+
+
+def solve_marks(
+    problem: Problem, columns: TermColumns, estimate: Estimate
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the map of the stage, (nodes,), the misalignments, and the squares of residuals.
+
+    In the frame of the equations, m; map and misalignments in the datum, the squares in units of
+    the residuals' covariance.
 
     With finite rotations, at the places of the stage: what the linear equations lack is taken off
     the readings until it stands still (Gauss-Newton).
@@ -297,46 +327,27 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     NotSettledError
         If the rotations of the plate do not converge.
     """
-    problem = readings.problem
-    shapes = readings.columns.shapes
-    effects = readings.effects
     system = problem.system
     grid = problem.system.grid
-    gauge = problem.system.gauge
-    reduced = reduce_columns(grid, shapes)
-    fields, misalignments, remaining = effects.projected(
-        (reduced.free, reduced.right, reduced.gram),
-        grid.response,
-        system.grid_inverse,
-        readings.variance,
-    )
-    gain = remaining @ effects.covariance / readings.variance
-    linear = problem.grid.y - shapes.combined(effects.mean)
-    plate = shapes.combined(effects.mean, readings.columns.rows([PLATE]))
-    moving = Moving(problem)
+    mean = estimate.effects.mean
+    linear = problem.grid.y - columns.shapes.combined(mean)
+    plate = columns.shapes.combined(mean, columns.rows([PLATE]))
+    moving, known_sites = Moving(problem), known_nodes(problem)
     lacking = np.zeros(grid.read.shape, dtype=complex)
     for _ in range(MAX_STEPS):
-        y = np.where(grid.read, linear - lacking, 0.0)
         before = lacking
-        field, parameters = system.grid_fit(y)
-        residuals = grid.plate(y, field, parameters)[1]
-        right = shapes.against(shapes.sums(grid.weight * residuals))
-        estimated = gain @ right
-        field = field - (fields @ estimated).reshape(field.shape)
-        modes = gauge.coefficients(field)
-        field = gauge.remove(field, modes)
-        parameters = parameters - misalignments @ estimated - modes @ system.rigid[:3]
+        y = np.where(grid.read, linear - lacking, 0.0)
+        free, parameters, square = estimate.solved(y)
+        field = free.reshape(grid.views.shape)
+        modes = system.gauge.coefficients(field)
+        field = system.gauge.remove(field, modes)
+        parameters = parameters - modes @ system.rigid[:3]
         lacking = grid.read * (
-            moving.change_of_readings(np.where(readings.known, field, 0.0))
+            moving.change_of_readings(np.where(known_sites, field, 0.0))
             + problem.excess(parameters, plate, grid.views.gather(field))
         )
         if np.abs(lacking - before).max() <= FLOOR:
-            square = float(
-                (grid.weight * np.abs(residuals) ** 2).sum() - estimated @ right
-            )
-            return PlateSolution(
-                field.ravel(), parameters, square / readings.variance, fields, remaining
-            )
+            return field.ravel(), parameters, square
     raise NotSettledError(
         "recheck",
         "the rotations of the plate do not converge",
@@ -344,59 +355,15 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     )
 
 
-def _map_of(
-    rows: np.ndarray,
-    field: np.ndarray,
-    fields: np.ndarray,
-    remaining: np.ndarray,
-    *,
-    effects: Effects,
-    covariance: np.ndarray,
-    known_values: np.ndarray,
-    dof: float,
-) -> NewMap:
-    """Return the map whose values are functionals, rows (n, q), of a field (n,).
-
-    `fields` and `remaining` are those of `PlateSolution`, `covariance` (q, q) is that of the values
-    if all effects are known.
-    """
-    fields = np.real(rows.conj().T @ fields)
-    of_effects = fields @ remaining
-    return NewMap(
-        known=known_values,
-        values=np.real(rows.conj().T @ field),
-        white=covariance + of_effects @ effects.covariance @ (fields - of_effects).T,
-        of_effects=of_effects,
-        effects=effects,
-        dof=dof,
-    )
-
-
 def map_of_marks(
-    readings: PlateReadings, solution: PlateSolution, dof: float
+    problem: Problem, estimate: Estimate, field: np.ndarray, sense: Sense, dof: float
 ) -> NewMap:
-    """Return the map of a solution."""
-    system = readings.problem.system
-    known_sites = turned_over(readings.sense, readings.known, sign=1)
-    rows = (
-        turned_over(readings.sense, unit_rows(known_sites))
-        .reshape(-1, known_sites.size)
-        .T
-    )
-    rows = system.gauge.without(rows)
-    white = readings.variance * MapsCovariance(system, system.grid_inverse).of_free(
-        rows, np.zeros((system.grid.n_marks, rows.shape[1]))
-    )
-    return _map_of(
-        rows,
-        solution.field,
-        solution.fields,
-        solution.remaining,
-        effects=readings.effects,
-        covariance=white,
-        known_values=np.tile(known_sites.ravel(), 2),
-        dof=dof,
-    )
+    """Return the map of a solution `field` of marks, whose noise has degrees of freedom."""
+    known_sites = turned_over(sense, known_nodes(problem), sign=1)
+    rows = turned_over(sense, unit_rows(known_sites))
+    rows = problem.system.gauge.without(rows.reshape(len(rows), -1).T)
+    known_values = np.tile(known_sites.ravel(), 2)
+    return estimate.new_map(field, rows, known_values, dof)
 
 
 def map_of_lines(
@@ -424,44 +391,23 @@ def map_of_lines(
         Of a line.
     """
     scale = lines.weight.sum()
-    spectrum = np.linalg.eigh(lines.schur)
-    variance = noise.sigma**2
-    determined = np.count_nonzero(spectrum[0] > GAP * scale) == lines.n_views - 1
+    values, vectors = np.linalg.eigh(lines.schur)
+    determined = np.count_nonzero(values > GAP * scale) == lines.n_views - 1
     known_lines = lines_turned_over(
         sense, (lines.components.of_site >= 0) & determined, sign=1
     )
     if not known_lines.any():
-        nothing = np.zeros((0, len(effects.mean)))
-        return NewMap(
-            known=known_lines,
-            values=np.zeros(0),
-            white=np.zeros((0, 0)),
-            of_effects=nothing,
-            effects=effects,
-            dof=noise.dof,
-        )
-    inverse = pseudo_inverse(spectrum[0], spectrum[1], scale)
-    fields, _, remaining = effects.projected(
-        lines_eliminated(lines, columns), lines.response, inverse, variance
+        none = np.zeros((0, len(effects.mean)))
+        return NewMap(known_lines, np.zeros(0), none @ none.T, none, effects, noise.dof)
+    estimate = Estimate(
+        lines,
+        pseudo_inverse(values, vectors, scale),
+        lines_eliminated(lines, columns),
+        columns.sums,
+        effects,
+        noise.sigma**2,
     )
     y = y - np.tensordot(effects.mean, columns.values, axes=1)
-    field, phi = lines.fitted(y, inverse)
-    estimated = (
-        remaining
-        @ effects.covariance
-        @ columns.sums(lines.weight * lines.plate(y, field, phi)[1])
-        / variance
-    )
     centre = np.eye(lines.n_lines)[:, known_lines]
     rows = lines_turned_over(sense, centre - centre.mean(axis=1, keepdims=True))
-    white = lines.solve(rows) + lines.response @ (inverse @ (lines.response.T @ rows))
-    return _map_of(
-        rows,
-        field - fields @ estimated,
-        fields,
-        remaining,
-        effects=effects,
-        covariance=variance * rows.T @ white,
-        known_values=known_lines,
-        dof=noise.dof,
-    )
+    return estimate.new_map(estimate.solved(y)[0], rows, known_lines, noise.dof)

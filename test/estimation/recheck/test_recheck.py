@@ -628,11 +628,10 @@ def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     columns = np.concatenate(
         [np.tile(np.eye(count)[:, None], (1, 2, 1)), of_term[None]]
     )
-    source = np.array(["known plate"] * count + ["terms"])
     effects = Effects.of(
-        source,
         np.append(np.ones(count), 4e-6),
-        plate,
+        np.append(np.arange(count), -1),
+        plate=plate,
         before=before,
         length=np.zeros(count),
     )
