@@ -8,6 +8,9 @@ from typing import Any
 
 from selfcal_ros.files import read
 
+READING_NOISE = "reading noise"
+"""The component that the noise of readings is."""
+
 
 @dataclass(frozen=True)
 class OfNoise:

@@ -44,7 +44,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     INTERPOLATION,
     budget_lines,
 )
-from selfcal_ros.model.budget import BudgetLine, OfRuns
+from selfcal_ros.model.budget import READING_NOISE, BudgetLine, OfRuns
 from selfcal_ros.model.error_map import (
     MANY_DOF,
     ErrorMap,
@@ -863,12 +863,12 @@ def _part_beside_noise(result: CalibrationResult, kind: str) -> float:
 
     It is of the plate and of terms. What runs share is in both, and not kept apart.
     """
-    powers = {"A": 0.0, "B": 0.0}
+    total = of_others = 0.0
     for line in result.budget:
         if line.quantity == kind and line.component != INTERPOLATION:
-            powers[line.kind] += line.effect_rms**2
-    total = sum(powers.values())
-    return powers["B"] / total if total > 0 else 1.0
+            total += line.effect_rms**2
+            of_others += line.effect_rms**2 * (line.component != READING_NOISE)
+    return of_others / total if total > 0 else 1.0
 
 
 def _shared_terms(result: CalibrationResult) -> list[str]:

@@ -47,7 +47,7 @@ from selfcal_ros.estimation.terms.planned import (
     rows_of,
     with_terms,
 )
-from selfcal_ros.model.budget import BudgetLine
+from selfcal_ros.model.budget import READING_NOISE, BudgetLine
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import TIMES, UNDETERMINED, ModelTerm, nominal_terms
@@ -312,8 +312,6 @@ def check_terms(
     )
 
 
-NOISE = "reading noise"
-
 QUANTITIES = ("xy", "theta")
 
 REMOVED = 0.7
@@ -361,7 +359,8 @@ class PlanBudget:
         effects_m = [
             line.effect_rms
             for line in (self.if_larger if if_larger else self.lines)
-            if line.quantity == quantity and (line.component == NOISE or not noise_only)
+            if line.quantity == quantity
+            and (line.component == READING_NOISE or not noise_only)
         ]
         return (
             float(np.sqrt(np.sum(np.square(effects_m)))) if effects_m else float("nan")
@@ -437,7 +436,7 @@ def _budget(
             determined
         ]
         lines.append(
-            _line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings")
+            _line(quantity, READING_NOISE, noise, u=sigma, unit=unit, source="readings")
         )
         for term in terms:
             effect = (
@@ -491,7 +490,7 @@ def _line(
     return BudgetLine(
         quantity=quantity,
         component=component,
-        kind="A" if component == NOISE else "B",
+        kind="A" if component == READING_NOISE else "B",
         value=float("nan"),
         u=u,
         unit=unit,
@@ -535,7 +534,7 @@ def _removals(
 
     out = {}
     for line in budget.lines:
-        if line.component == NOISE or not budget.share(line) > OWED:
+        if line.component == READING_NOISE or not budget.share(line) > OWED:
             continue
         kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)

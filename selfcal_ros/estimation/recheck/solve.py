@@ -82,9 +82,13 @@ from selfcal_ros.estimation.terms.columns import (
 )
 from selfcal_ros.estimation.terms.visits import term_inputs, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
-from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
+from selfcal_ros.estimation.verdict.uncertainty import (
+    INTERPOLATION,
+    budget_lines,
+    noise_line,
+)
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.budget import BudgetLine, Details, OfNoise, OfPlate
+from selfcal_ros.model.budget import BudgetLine, OfPlate
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, datum_modes, rms
 from selfcal_ros.model.findings import (
     Changed,
@@ -884,44 +888,33 @@ def _sources(
 ) -> Iterator[BudgetLine]:
     """Yield a line of the budget for each source of the variances of a map."""
     unit = {"xy": "m", "theta": "rad"}[quantity]
-    noise, inf = result.noise, float("inf")
-    sigma = getattr(noise, f"sigma_{quantity}")
-    by = next(
-        (
-            way
-            for way in ("declared", "repeats")
-            if getattr(noise, f"sigma_{quantity}_{way}") == sigma
-        ),
-        "residuals",
-    )
     u_of_length = float(np.sqrt(plate.variance_of_length))
     dof_of_plate = plate.result.noise.dof_of(quantity)
-    rows: dict[str, tuple[str, float, str, float, str]] = {
-        NOISE: ("A", sigma, unit, getattr(noise, f"dof_{quantity}"), "readings"),
+    rows = {
         # a combined value, of both types, from a certificate (GUM 4.3.1)
-        PLATE: ("B", rms(u_of_plate), unit, dof_of_plate, "declared"),
-        TEMPERATURE: ("B", u_of_length, "m/m", inf, "declared"),
-        TERMS: ("B", float("nan"), unit, inf, "default"),
+        PLATE: (rms(u_of_plate), unit, dof_of_plate, "declared"),
+        TEMPERATURE: (u_of_length, "m/m", np.inf, "declared"),
+        TERMS: (float("nan"), unit, np.inf, "default"),
     }
     for name, variance in variances.items():
         if name == TEMPERATURE and plate.reference is None:
             continue
-        kind, u, unit_of_u, dof, source = rows[name]
         u_map = np.sqrt(variance)
-        details: Details = OfPlate(plate.where)
         if name == NOISE:
-            details = OfNoise(by, contradicted=False)
+            yield noise_line(quantity, u_map, result.noise, otherwise="residuals")
+            continue
+        u, unit_of_u, dof, source = rows[name]
         yield BudgetLine(
             quantity=quantity,
             component=name,
-            kind=kind,
+            kind="B",
             u=u,
             unit=unit_of_u,
             effect_rms=rms(u_map),
             effect_max=float(u_map.max()),
             dof=dof,
             source=source,
-            details=details,
+            details=OfPlate(plate.where),
         )
 
 

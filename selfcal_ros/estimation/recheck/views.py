@@ -21,10 +21,11 @@ from selfcal_ros.estimation.normal.eliminated import PlateEliminated
 from selfcal_ros.estimation.normal.equations import pseudo_inverse
 from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
 from selfcal_ros.estimation.terms.equations import lines_eliminated, reduce_columns
+from selfcal_ros.model.budget import READING_NOISE
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import Observability
 
-NOISE, TERMS = "reading noise", "terms"
+NOISE, TERMS = READING_NOISE, "terms"
 PLATE, TEMPERATURE = "known plate", "plate temperature"
 """Sources of the uncertainty of a map: of the readings, and of what is known of the plate."""
 

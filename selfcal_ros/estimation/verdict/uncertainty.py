@@ -19,6 +19,7 @@ from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.options import OWED
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.budget import (
+    READING_NOISE,
     BudgetLine,
     OfAssumption,
     OfCause,
@@ -385,7 +386,7 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     of_terms, of_reference = variance_of_terms(result), variance_of_reference(result)
     # the uncertainty of the map includes those of reference and terms, which have their own lines
     power = power - sum(of_terms.values()) - of_reference
-    yield _noise_line("xy", np.sqrt(np.maximum(power, 0.0)), noise)
+    yield noise_line("xy", np.sqrt(np.maximum(power, 0.0)), noise)
     for name, variance in of_terms.items():
         yield _term_line("xy", name, np.sqrt(variance[:, emap.valid]), result)
     yield _reference_line(np.sqrt(of_reference), result.reference)
@@ -394,7 +395,7 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
         power_of_noise = emap.u_g_theta**2 - sum(
             u**2 for u in result.kept.angular.values()
         )
-        yield _noise_line("theta", np.sqrt(np.maximum(power_of_noise, 0.0)), noise)
+        yield noise_line("theta", np.sqrt(np.maximum(power_of_noise, 0.0)), noise)
         for name, u in result.kept.angular.items():
             yield _term_line("theta", name, u, result)
         yield _interpolation_theta(result)
@@ -409,14 +410,20 @@ def _or_infinite(dof: float) -> float:
     return dof if dof > 0 else np.inf
 
 
-def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
-    """Return the contribution of the noise of readings to a map."""
+def noise_line(
+    kind: str, u: np.ndarray, noise: Noise, *, otherwise: str = "together"
+) -> BudgetLine:
+    """Return the contribution of the noise of readings to a map.
+
+    `otherwise` is how the noise was found if it is that of neither residuals, repeats nor
+    detections.
+    """
     sigma, p = getattr(noise, f"sigma_{kind}"), getattr(noise, f"p_{kind}")
     unit = "m" if kind == "xy" else "rad"
     if not (np.isfinite(sigma) and sigma > 0):
         return BudgetLine(
             quantity=kind,
-            component="reading noise",
+            component=READING_NOISE,
             kind="A",
             unit=unit,
             source="readings",
@@ -427,11 +434,11 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
             for source in ("residuals", "repeats", "declared")
             if getattr(noise, f"sigma_{kind}_{source}") == sigma
         ),
-        "together",
+        otherwise,
     )
     return BudgetLine(
         quantity=kind,
-        component="reading noise",
+        component=READING_NOISE,
         kind="B" if by == "declared" else "A",
         u=sigma,
         unit=unit,

@@ -26,6 +26,7 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import effect_everywhere, enlarged
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import BudgetLine
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.kept import Covariance, Kept
 from selfcal_ros.model.readings import Sense
@@ -340,6 +341,27 @@ def test_what_rechecks_share_does_not_average_out():
     assert np.mean(away < found.noise.k_theta) > 0.9
     u_of_runs = np.mean([run.error_map.u_g_theta for run in runs], axis=0)
     assert 0.9 < np.mean(emap.u_g_theta / u_of_runs) < 1.3
+
+
+def test_noise_that_the_detections_of_rechecks_declare_averages_out():
+    """It is of type B, as is what they share."""
+    noise = BudgetLine(
+        quantity="xy",
+        component="reading noise",
+        kind="B",
+        unit="m",
+        effect_rms=1e-9,
+        source="declared",
+    )
+    plates = [
+        SimpleNamespace(calibration=SimpleNamespace(readings={"sha256": plate}))
+        for plate in ("first", "second")
+    ]
+    runs = [
+        part(name, replace(result, budget=(noise,), recheck=plate))
+        for name, result, plate in zip("ab", (A, B), plates, strict=True)
+    ]
+    assert not combine(runs).xy.common.any()
 
 
 def test_a_scale_of_the_lines_that_is_assumed_does_not_average_out():

@@ -10,12 +10,12 @@ import pytest
 from selfcal_ros.estimation.observability import resistance as module
 from selfcal_ros.estimation.observability.plan_check import check_stops, predict_plan
 from selfcal_ros.estimation.observability.resistance import (
-    NOISE,
     effects_of_terms,
     plan_budget,
 )
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.budget import READING_NOISE
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm, default_terms, in_order, parse_terms
 from selfcal_ros.model.view import Plan, View
@@ -49,7 +49,7 @@ def test_each_line_is_what_is_gained_if_its_term_is_known_as_well():
     named = {term.name: term for term in TERMS}
     order = in_order(named.values())
     gains = [SIGMA * dense.gain(tuple(order[at:])) for at in range(len(order) + 1)]
-    assert found.pop(NOISE) == pytest.approx(gains[-1], rel=1e-6)
+    assert found.pop(READING_NOISE) == pytest.approx(gains[-1], rel=1e-6)
     for term, more, less in zip(order, gains, gains[1:], strict=False):
         assert found[term.name] == pytest.approx(
             np.sqrt(more**2 - less**2), rel=1e-4
@@ -77,13 +77,13 @@ def test_a_free_term_adds_to_the_noise():
         Dense(plan, assumed),
     )
     free = SIGMA * dense.gain((terms[0],))
-    assert effects(found)[NOISE] == pytest.approx(free, rel=1e-6)
+    assert effects(found)[READING_NOISE] == pytest.approx(free, rel=1e-6)
     assert effects(found)["plate_strain"] == pytest.approx(
         np.sqrt((SIGMA * dense.gain(terms)) ** 2 - free**2), rel=1e-4
     )
     assert [line.source for line in found.lines] == ["readings", "declared"]
     assert found.u_rms("xy") == pytest.approx(SIGMA * dense.gain(terms), rel=1e-6)
-    assert found.u_rms("xy", noise_only=True) == effects(found)[NOISE]
+    assert found.u_rms("xy", noise_only=True) == effects(found)[READING_NOISE]
     assert sum(map(found.share, found.lines)) == pytest.approx(1)
 
 
@@ -136,7 +136,7 @@ def test_the_lines_have_a_budget_of_their_own():
     # marks so good that they tell the rotations
     found = budget_of(LINES, terms, Assumed(1e-12, sigma_rad=sigma))
     assert found.u_rms("theta") == pytest.approx(dense_lines(sizes, sigma), rel=1e-3)
-    assert effects(found, "theta")[NOISE] == pytest.approx(
+    assert effects(found, "theta")[READING_NOISE] == pytest.approx(
         dense_lines((1e-12, 1e-12), sigma), rel=1e-3
     )
     assert effects(found, "theta")["line_eccentricity"] == pytest.approx(

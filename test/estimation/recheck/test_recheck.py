@@ -340,9 +340,16 @@ def test_the_noise_is_what_detections_declare_if_that_is_larger():
         (96, 6e-8, 6e-8),
     ):
         declaring = replace(view, dof_xy=dof, u=declared / np.sqrt(view.count))
-        noise = recheck(replace(after, views=(declaring,)), linear(), plate).noise
-        assert noise.sigma_xy == pytest.approx(sigma)
-        assert noise.sigma_xy_declared == pytest.approx(declared)
+        found = recheck(replace(after, views=(declaring,)), linear(), plate)
+        assert found.noise.sigma_xy == pytest.approx(sigma)
+        assert found.noise.sigma_xy_declared == pytest.approx(declared)
+        by_detections = sigma == declared
+        line = found.budget[0]  # as that of a calibration
+        assert (line.component, line.kind, line.source) == (
+            "reading noise",
+            "B" if by_detections else "A",
+            "declared" if by_detections else "readings",
+        )
 
 
 def test_marks_and_lines_that_are_missing_are_unknown():
