@@ -13,12 +13,11 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.checks.wiring import with_offsets
-from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL, NEGLIGIBLE
 from selfcal_ros.estimation.normal.angular import MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.observability.rank import DETERMINED
-from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.findings import FewRead, FewReadCell, Finding
@@ -477,12 +476,7 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
         return None
     noise = model.fitted.xy
     coefficients = model.coefficients
-    now = score(
-        free,
-        model.fitted.both_residuals,
-        squares(model.problem, model.fitted),
-        coefficients=coefficients,
-    )
+    now = model.scored(free, coefficients)
     inverse = free.inverse(noise.sigma)
     values = coefficients + inverse @ (
         free.unbiased_sums(now.total) - free.prior(noise.sigma) * coefficients

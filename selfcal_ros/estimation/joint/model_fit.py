@@ -31,7 +31,6 @@ from selfcal_ros.estimation.joint.problem import (
     Problem,
     angular_part,
     fit,
-    grid_dof,
     least_noise_rad,
     noise_excess,
     sigma_of,
@@ -41,6 +40,7 @@ from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS, ROUNDED
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import (
+    Score,
     SizeTest,
     TermEquations,
     equations_of_columns,
@@ -94,6 +94,15 @@ class ModelFit:
     def covariance(self) -> np.ndarray:
         """Covariance of the coefficients for unit noise of one grid reading, (p, p)."""
         return self.equations.inverse(self.fitted.xy.sigma)
+
+    def scored(self, equations: TermEquations, coefficients: np.ndarray) -> Score:
+        """Return the score of columns of which `coefficients` (p,) are taken off the readings."""
+        return score(
+            equations,
+            self.fitted.both_residuals,
+            squares(self.problem, self.fitted),
+            coefficients=coefficients,
+        )
 
     def visits_about_means(self) -> Iterator[tuple[int, ViewVisits, np.ndarray]]:
         """Yield row and visits of each view, and what they have more than the means of their marks.
@@ -403,18 +412,16 @@ def squares(
     (`of_noise`), lines that have less than they are weighted with do not count.
     """
     system = problem.system
-    total = float((system.grid.weight * abs(fitted.residuals) ** 2).sum())
-    dof = grid_dof(problem)
+    total = system.grid.squares(fitted.residuals)
+    dof = system.dof_grid
     if fitted.ratio > 0:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += max(shared - 1, 0)
         least_rad = least_noise_rad(problem, fitted.xy.sigma)
         if not (of_noise and fitted.theta.sigma < least_rad):
-            squares_rad = float(
-                (system.angular.weight * fitted.residuals_theta**2).sum()
-            )
+            squares_rad = system.angular.squares(fitted.residuals_theta)
             total += fitted.ratio * problem.half_width_m**2 * squares_rad
-            dof += system.angular.n_readings - system.rank_angular
+            dof += system.dof_angular
     return total, dof
 
 
@@ -487,7 +494,7 @@ def finer(model: ModelFit) -> ModelFit | None:
         return None
     views = system.grid.views
     splines = [views.spline.refined]
-    if views.spline.axes[0].degree == 1:
+    if views.bilinear:
         smooth = MapSpline.of(views.artifact.field, Interpolation.BICUBIC)
         splines += [smooth, smooth.refined]
     fits = [
@@ -538,12 +545,7 @@ def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
     """Return a fit with the coefficients of the terms fitted once more."""
     problem, fitted = model.problem, model.fitted
     equations = equations_of(problem, fitted, columns)
-    now = score(
-        equations,
-        fitted.both_residuals,
-        squares(problem, fitted),
-        coefficients=model.coefficients,
-    )
+    now = model.scored(equations, model.coefficients)
     values = next_coefficients(
         equations,
         now,
@@ -650,13 +652,8 @@ def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ..
     equations = model.equations
     if equations.free.all():
         return ()
-    scored = score(
-        equations,
-        model.fitted.both_residuals,
-        squares(model.problem, model.fitted),
-        coefficients=model.coefficients,
-    )
-    right = scored.total + equations.information @ model.coefficients
+    now = model.scored(equations, model.coefficients)
+    right = now.total + equations.information @ model.coefficients
     noise = model.fitted.xy
     excess = noise_excess(model.problem, model.fitted.residuals)
     return size_tests(

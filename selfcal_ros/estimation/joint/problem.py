@@ -341,11 +341,12 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     grid = problem.system.grid
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    residuals = problem.residuals_xy or sigma_of(total, grid_dof(problem))
+    dof = problem.system.dof_grid
+    residuals = problem.residuals_xy or sigma_of(total, dof)
     repeats = problem.repeats_xy
     if problem.images is not None and total > 0:  # of which residuals show only part
         n_taken = problem.images.dof_of_terms if problem.residuals_xy else 0
-        without_images = sigma_of(total, grid_dof(problem) - n_taken)
+        without_images = sigma_of(total, dof - n_taken)
         noises = problem.images.noises(residual)
         residuals = (
             residuals[0] * noises.sigma / without_images[0],
@@ -362,11 +363,6 @@ def noise_excess(problem: Problem, residual: np.ndarray) -> float:
     """
     images = problem.images
     return 1.0 if images is None else images.noises(residual).excess(images.marks)
-
-
-def grid_dof(problem: Problem) -> int:
-    """Return the degrees of freedom of the grid residuals without terms."""
-    return 2 * problem.system.grid.n_readings - problem.system.rank_grid
 
 
 def sigma_of(total: float, dof: float) -> tuple[float, float]:
@@ -655,8 +651,8 @@ def angular_part(problem: Problem) -> AngularPart:
         nothing = noise_estimate((float("nan"), 0), (float("nan"), 0), float("nan"))
         return AngularPart(np.full(angular.n_lines, np.nan), np.zeros(0), nothing)
     residual = angular_residuals(problem.system, y)
-    dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
-    total = float((angular.weight * residual**2).sum())
+    dof = problem.system.dof_angular - problem.dof_lines
+    total = angular.squares(residual)
     noise = noise_estimate(
         problem.repeats_theta,
         sigma_of(total, dof),

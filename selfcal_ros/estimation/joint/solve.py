@@ -536,7 +536,10 @@ def _solved(
         measurements, model, cover, sigma, with_uncertainty=with_uncertainty
     )
     # without a reference length the datum leaves the map no scale
-    of_map = 0.0 if options.reference is None else _scale_of_map(model)
+    of_map = 0.0
+    if options.reference is not None:
+        scale = problem.system.gauge.coefficients(fitted.field)[3]
+        of_map = float(scale) / problem.half_width_m
     artifact_map = _artifact_map(
         model, cover if with_uncertainty else None, rms(sigma), of_map
     )
@@ -845,16 +848,6 @@ def _artifact_map(
         u_ay=u_y,
         u_a_theta=u_theta,
     )
-
-
-def _scale_of_map(model: ModelFit) -> float:
-    """Return the least-squares scale of the map, m/m."""
-    system = model.problem.system
-    of_sites = (system.grid.views.z_sites, model.fitted.field)
-    z, values = (of[system.known_sites] for of in of_sites)
-    z = z - z.mean()
-    scale = np.vdot(z, values).real / np.vdot(z, z).real
-    return float(scale) / model.problem.half_width_m
 
 
 def views_of(

@@ -231,6 +231,10 @@ class PlateEliminated(ABC):
         out = np.where(self.read, residual - a, 0.0)
         return a.squeeze(axis=-self.weight.ndim), out
 
+    def squares(self, residuals: np.ndarray) -> float:
+        """Return the weighted sum of squares of residuals (views, *marks)."""
+        return float((self.weight * np.abs(residuals) ** 2).sum())
+
     def functionals(
         self, sites: np.ndarray, marks: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -192,6 +192,16 @@ class NormalEquations:
         turns = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
         return self.angular.rank + turns
 
+    @property
+    def dof_grid(self) -> int:
+        """Degrees of freedom of the residuals of marks fitted alone."""
+        return 2 * self.grid.n_readings - self.rank_grid
+
+    @property
+    def dof_angular(self) -> int:
+        """Degrees of freedom of the residuals of lines fitted alone."""
+        return self.angular.n_readings - self.rank_angular
+
     @cached_property
     def _null(self) -> np.ndarray:
         """Orthonormal undetermined misalignments, (size, nullity)."""
@@ -604,7 +614,7 @@ class PlacedEquations(NormalEquations):
         if grid.too_large_to_refine:
             return True
         n_left = grid.equations_of_map
-        if spline.axes[0].degree == 1:  # a smooth map of the same nodes tests them
+        if grid.views.bilinear:  # a smooth map of the same nodes tests them
             return self.dof_of_map < ENOUGH_DOF
         if n_left > 2 * math.prod(spline.refined.shape):
             return False

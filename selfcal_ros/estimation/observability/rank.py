@@ -409,8 +409,8 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     grid = system.grid
     y = grid.views.gather(field) * grid.read
     residual = grid.centred(y) * grid.read
-    total = float((grid.weight * abs(residual) ** 2).sum())
-    scale = float((grid.weight * abs(y) ** 2).sum())
+    total = grid.squares(residual)
+    scale = grid.squares(y)
     right = np.zeros(system.size)
     right[: 3 * grid.n_views] = grid.right_side(y)[1]
     block = np.zeros((system.size, system.size))

@@ -230,7 +230,7 @@ class Estimate:
         residuals = system.plate(y, field, parameters)[1]
         right = self.against(system.weight * residuals)
         estimated = self.remaining @ (self.effects.covariance @ right) / self.variance
-        total = (system.weight * np.abs(residuals) ** 2).sum()
+        total = system.squares(residuals)
         return (
             field - self.fields @ estimated,
             parameters - self.misalignments @ estimated,

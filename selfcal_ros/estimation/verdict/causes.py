@@ -26,7 +26,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.blocks import AXES, block_of, blocks, differences, traits_of
 from selfcal_ros.estimation.checks.wiring import BEYOND
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import (
     Problem,
     fit,
@@ -41,7 +41,6 @@ from selfcal_ros.estimation.terms.equations import (
     CAUSE_LEVEL,
     Score,
     TermEquations,
-    score,
 )
 from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
@@ -592,12 +591,7 @@ def find_explanations(
     equations = equations_of(problem, model.fitted, columns)
     coefficients = np.zeros(equations.n)
     coefficients[: len(model.coefficients)] = model.coefficients
-    right_side = score(
-        equations,
-        model.fitted.both_residuals,
-        squares(problem, model.fitted),
-        coefficients=coefficients,
-    )
+    right_side = model.scored(equations, coefficients)
     # images determine the yaw: no other cause may gain from a size that is too small for it
     sized = columns.rows([name for name in own_terms if not block_of(name).of_images])
     prior = np.where(sized, equations.prior(model.fitted.xy.sigma), 0.0)

@@ -115,7 +115,7 @@ def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> FitOf
         residual=grid_residuals(system, y),
         weight=system.grid.weight,
         redundancy=redundancy,
-        dof=2 * system.grid.n_readings - system.rank_grid,
+        dof=system.dof_grid,
         skew=skew,
     )
 
@@ -127,7 +127,7 @@ def lines_alone(system: NormalEquations, y: np.ndarray) -> FitOfKind:
         residual=angular_residuals(system, y),
         weight=system.angular.weight,
         redundancy=angular_redundancy(system),
-        dof=system.angular.n_readings - system.rank_angular,
+        dof=system.dof_angular,
         skew=np.zeros(y.shape),
     )
 

@@ -115,7 +115,7 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         return None
     coarse, fine = _of_marks(model), _of_marks(refined)
     dof = system.grid.equations_of_map - fine.determined_coefficients
-    if dof < 1 and not _is_bilinear(coarse):
+    if dof < 1 and not system.grid.views.bilinear:
         return None
     finer = _against_finer(model, coarse, refined, fine)
     smoother = _against_smoother(model, coarse)
@@ -188,7 +188,7 @@ def _against_smoother(model: ModelFit, coarse: PlacedEquations) -> _Comparison:
     `coarse` are the equations of the marks alone.
     """
     nothing = _Comparison(1.0, np.zeros(2 * len(known_places(coarse))))
-    if not _is_bilinear(coarse):
+    if not coarse.grid.views.bilinear:
         return nothing
     squares = _squares(coarse, model.y)
     if squares <= coarse.grid.equations_of_map * FLOOR**2:
@@ -200,10 +200,6 @@ def _against_smoother(model: ModelFit, coarse: PlacedEquations) -> _Comparison:
     squares_smooth = max(_squares(_of_marks(smooth), smooth.y), FLOOR * squares)
     exponent = coarse.dof_of_map / 2 * math.log(squares_smooth / squares)
     return _Comparison(math.exp(min(exponent, 0.0)), _apart(smooth, model, coarse))
-
-
-def _is_bilinear(system: PlacedEquations) -> bool:
-    return system.grid.views.spline.axes[0].degree == 1
 
 
 def _of_marks(model: ModelFit) -> PlacedEquations:
@@ -280,8 +276,7 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
 def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the squares of residuals of lines fitted alone, and their map without its mean."""
     field, phi = lines.fitted(y, np.linalg.pinv(lines.schur, rcond=GAP, hermitian=True))
-    residuals_rad = lines.plate(y, field, phi)[1]
-    return float((lines.weight * residuals_rad**2).sum()), field - field.mean()
+    return lines.squares(lines.plate(y, field, phi)[1]), field - field.mean()
 
 
 def known_places(system: PlacedEquations) -> np.ndarray:
@@ -308,7 +303,7 @@ def _halves(system: PlacedEquations) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _squares(system: PlacedEquations, y: np.ndarray) -> float:
-    return float((system.grid.weight * np.abs(grid_residuals(system, y)) ** 2).sum())
+    return system.grid.squares(grid_residuals(system, y))
 
 
 def _apart(smooth: ModelFit, model: ModelFit, coarse: PlacedEquations) -> np.ndarray:

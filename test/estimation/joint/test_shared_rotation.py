@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.comparison.covariance import system_behind
-from selfcal_ros.estimation.joint.problem import grid_dof
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.rank import deficiency, unknowns_of
@@ -95,7 +94,7 @@ def test_numbers_of_unknowns_and_of_degrees_of_freedom_are_those_of_the_matrix(m
     matrix = dense(measurements)[0]
     problem = solve_joint(measurements, LINEAR).model.problem
     rank = np.linalg.matrix_rank(matrix, tol=1e-9)
-    assert grid_dof(problem) == len(matrix) - rank
+    assert problem.system.dof_grid == len(matrix) - rank
     assert problem.system.rank_grid == rank == matrix.shape[1] - 7
     assert unknowns_of(problem.system) == matrix.shape[1]
 
