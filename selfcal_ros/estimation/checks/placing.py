@@ -27,6 +27,7 @@ from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M, MAX_REMOVED
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import EDGE, AnyPose, LatticePose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import View
 
 WINDOW = 3
 """Sites used on either side of the centre of the field."""
@@ -123,35 +124,11 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     one of them.
     """
     artifact = measurements.artifact
-    repeated = [v for v in measurements.views if v.dof_xy]
-    window_views = [
-        (view.view, readings)
-        for view in measurements.views
-        if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
-        and (readings := _readings_in_window(artifact, view)) is not None
-    ]
-    compared_views = [
-        (view, readings)
-        for view, readings in window_views
-        if view.cell in (None, (0, 0))
-    ]
-    if len(compared_views) < 3:
-        compared_views = window_views
+    compared_views = _compared_views(measurements)
     views = [readings for _, readings in compared_views]
     if len(views) < 3:
         return None
-    sigma = (
-        np.sqrt(
-            np.average(
-                [view.sigma_xy**2 for view in repeated],
-                weights=[view.dof_xy for view in repeated],
-            )
-        )
-        if repeated
-        else 0.0
-    )
-    noise, spread = _sizes(views, float(sigma))
-    noise = noise if repeated else UNREPEATED * spread
+    noise, spread = _sizes(measurements, views)
     if not spread > max(2 * noise, LEAST_NOISE_M):
         return None
     grid = artifact.map_grid
@@ -201,6 +178,21 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
     return Misplaced.of(view.plan_view, planned_pose, pose)
+
+
+def _compared_views(measurements: Measurements) -> list[tuple[View, _WindowReadings]]:
+    """Return the views with their readings in the window; of images those on the optical axis.
+
+    Or of their neighbours as well, where those alone are fewer than three.
+    """
+    window_views = [
+        (view.view, readings)
+        for view in measurements.views
+        if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
+        and (readings := _readings_in_window(measurements.artifact, view)) is not None
+    ]
+    on_axis = [item for item in window_views if item[0].cell in (None, (0, 0))]
+    return on_axis if len(on_axis) >= 3 else window_views
 
 
 def _mirrored(
@@ -361,7 +353,9 @@ def _readings_in_window(
     )
 
 
-def _sizes(views: list[_WindowReadings], sigma: float) -> tuple[float, float]:
+def _sizes(
+    measurements: Measurements, views: list[_WindowReadings]
+) -> tuple[float, float]:
     """Return the noise of a mean and the spread of stage and plate errors, m, by component."""
     total, free = 0.0, 0
     for readings in views:
@@ -370,8 +364,16 @@ def _sizes(views: list[_WindowReadings], sigma: float) -> tuple[float, float]:
         residuals_m = readings.deviation - motion @ lies
         total = total + float(np.sum(np.abs(residuals_m) ** 2))
         free = free + len(residuals_m) - FREE
+    spread = float(np.sqrt(total / (2 * max(free, 1))))
+    repeated = [view for view in measurements.views if view.dof_xy]
+    if not repeated:
+        return UNREPEATED * spread, spread
     share = np.concatenate([1 / readings.count for readings in views]).mean()
-    return sigma * float(np.sqrt(share)), float(np.sqrt(total / (2 * max(free, 1))))
+    variance = np.average(
+        [view.sigma_xy**2 for view in repeated],
+        weights=[view.dof_xy for view in repeated],
+    )
+    return float(np.sqrt(variance * share)), spread
 
 
 def _motion(readings: _WindowReadings) -> np.ndarray:

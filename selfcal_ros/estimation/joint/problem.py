@@ -604,14 +604,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
 
     field, parameters, plate, residuals = system.in_datum(y, field, parameters)
     if problem.reference is not None:
-        grown = scale_of(
-            system, problem.reference, field=field, plate=plate, half_width_m=length
-        )
-        # across, a distance changes by the square
-        if problem.reference.marks is not None:
-            across = np.vdot(scale_of_plate(system, problem.reference), plate).imag
-            true = length * (1 + problem.reference.relative_error)
-            grown += true - np.sqrt(max(true**2 - across**2, 0.0))
+        grown = _grown(problem, problem.reference, field=field, plate=plate)
         field = field + grown * grid.views.z_sites
         plate = plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
@@ -642,6 +635,26 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
         inverse=inverse,
         ratio=ratio,
     )
+
+
+def _grown(
+    problem: Problem,
+    reference: ReferenceLength,
+    *,
+    field: np.ndarray,
+    plate: np.ndarray,
+) -> float:
+    """Return the scale that a reference length gives maps in their datum, m at the half width.
+
+    Across the distance of two marks it changes by the square.
+    """
+    system, length = problem.system, problem.half_width_m
+    grown = scale_of(system, reference, field=field, plate=plate, half_width_m=length)
+    if reference.marks is not None:
+        across = np.vdot(scale_of_plate(system, reference), plate).imag
+        true = length * (1 + reference.relative_error)
+        grown += true - np.sqrt(max(true**2 - across**2, 0.0))
+    return grown
 
 
 def angular_part(problem: Problem) -> AngularPart:

@@ -716,8 +716,8 @@ def _error_map(
     `sigma` is the noise of a reading as it counts at each site, m; what is kept has
     no images yet. The uncertainty is given if it is `with_uncertainty`.
     """
-    problem, fitted = model.problem, model.fitted
-    system = problem.system
+    fitted, sense = model.fitted, measurements.sense
+    system = model.problem.system
     u_xy = np.full((2, *system.grid.views.shape), np.nan)
     u_theta = np.full(system.angular.n_lines, np.nan)
     closure = None
@@ -725,51 +725,68 @@ def _error_map(
     if cover is not None:
         lines = LinesCovariance(cover, (fitted.xy.sigma, fitted.theta.sigma))
         if with_uncertainty:
-            variance = cover.of_stage
-            if system.grid.n_sites <= MAX_NODES:
-                more = structured(model, cover)
-                variance = variance + more
-                # O and R are combinations of nodes, whose noises are correlated
-                if np.any(more):
-                    kept_parts = Kept(
-                        added=np.asarray(structured(model, cover, system.gauge.shear))
-                    )
-            u_xy = np.sqrt(np.maximum(variance, 0.0)) * sigma
+            u_xy, added = _u_of_marks(model, cover, sigma)
+            kept_parts = Kept(added=added)
         if system.angular.n_views:
-            variance, closure = lines.of_stage(problem.conditions)
+            variance, closure = lines.of_stage(model.problem.conditions)
             u_theta = np.sqrt(variance) if with_uncertainty else u_theta
-        if with_uncertainty and problem.terms:
-            roots = roots_by_term(cover.covariance_of_terms, model.equations.columns)
-            beside_map = _beside_map(model, lines, measurements.sense)
-            kept_parts = replace(
-                kept_parts,
-                factors=saved_terms(cover, roots, measurements.sense, beside_map),
-            )
-            if system.angular.n_views:
-                turned = lines.stage_of_terms(problem.conditions) * fitted.xy.sigma
-                of_lines = angular_terms(turned, roots, least=NEGLIGIBLE * rms(u_theta))
-                kept_parts = replace(
-                    kept_parts,
-                    angular={
-                        name: lines_turned_over(measurements.sense, u, sign=1)
-                        for name, u in of_lines.items()
-                    },
-                )
-    known_sites = system.known_sites
-    field = np.where(known_sites, fitted.field, complex(np.nan, np.nan))
+        if with_uncertainty and model.problem.terms:
+            factors, angular = _kept_terms(model, lines, sense, rms(u_theta))
+            kept_parts = replace(kept_parts, factors=factors, angular=angular)
+    field = np.where(system.known_sites, fitted.field, complex(np.nan, np.nan))
     g_theta = np.where(system.known_lines, fitted.g_theta, np.nan)
-    sense = measurements.sense
     field = turned_over(sense, field)
-    u_xy = np.stack([turned_over(sense, u, sign=1) for u in u_xy])
-    g_theta = lines_turned_over(sense, g_theta)
-    u_theta = lines_turned_over(sense, u_theta, sign=1)
     emap = ErrorMap.of_maps(
         measurements.artifact.field,
-        (np.stack([field.real, field.imag]), u_xy),
-        (g_theta, u_theta),
+        (
+            np.stack([field.real, field.imag]),
+            np.stack([turned_over(sense, u, sign=1) for u in u_xy]),
+        ),
+        (
+            lines_turned_over(sense, g_theta),
+            lines_turned_over(sense, u_theta, sign=1),
+        ),
     )
-    datum = problem.conditions.datum
+    datum = model.problem.conditions.datum
     return replace(emap, datum_theta=datum), closure, kept_parts
+
+
+def _u_of_marks(
+    model: ModelFit, cover: MapsCovariance, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return u of the XY map, (2, nx, ny), m, and what unequal noise adds to O and R, if it does.
+
+    The latter as `Kept.added`: they are combinations of nodes, whose noises are correlated.
+    """
+    system = model.problem.system
+    variance = cover.of_stage
+    added = None
+    if system.grid.n_sites <= MAX_NODES:
+        more = structured(model, cover)
+        variance = variance + more
+        if np.any(more):
+            added = np.asarray(structured(model, cover, system.gauge.shear))
+    return np.sqrt(np.maximum(variance, 0.0)) * sigma, added
+
+
+def _kept_terms(
+    model: ModelFit, lines: LinesCovariance, sense: Sense, u_theta: float
+) -> tuple[Factors | None, dict[str, np.ndarray]]:
+    """Return the factors of the terms, and what they contribute to u of lines, rad, (K,) each.
+
+    `u_theta` is that of the lines, rms, rad.
+    """
+    columns, sigma_m = model.equations.columns, model.fitted.xy.sigma
+    roots = roots_by_term(lines.cover.covariance_of_terms, columns)
+    beside_map = _beside_map(model, lines, sense)
+    factors = saved_terms(lines.cover, roots, sense, beside_map)
+    if not lines.angular.n_views:
+        return factors, {}
+    turned = lines.stage_of_terms(model.problem.conditions) * sigma_m
+    of_lines = angular_terms(turned, roots, least=NEGLIGIBLE * u_theta)
+    return factors, {
+        name: lines_turned_over(sense, u, sign=1) for name, u in of_lines.items()
+    }
 
 
 def _beside_map(
