@@ -17,6 +17,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
+from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import BEYOND, SHOWN
 from selfcal_ros.estimation.comparison.covariance import (
@@ -712,7 +713,8 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     require_own_readings(members, common, scale=not keep_scale)
     shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known_sites)}
     if lines.sum() > 1:
-        shapes["theta"] = _waves(lines)
+        angle_rad = 2 * np.pi * np.flatnonzero(lines) / len(lines)
+        shapes["theta"] = fourier_basis(angle_rad, DEGREE)[:, 1:]
     same_length = keep_scale and not _lengths_of_their_own(members)
     means = {
         kind: mean_of(
@@ -926,13 +928,6 @@ def _polynomials(x: np.ndarray, y: np.ndarray, known_sites: np.ndarray) -> np.nd
             values = x ** (degree - power) * y**power
             columns += [(values, zero), (zero, values)]
     return np.array([np.concatenate(column) for column in columns]).T
-
-
-def _waves(lines: np.ndarray) -> np.ndarray:
-    angle = 2 * np.pi * np.flatnonzero(lines) / len(lines)
-    return np.array(
-        [wave(k * angle) for k in range(1, DEGREE + 1) for wave in (np.cos, np.sin)]
-    ).T
 
 
 def _result(

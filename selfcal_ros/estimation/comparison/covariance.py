@@ -17,6 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import (
     LinesCovariance,
@@ -473,8 +474,7 @@ class Together:
         if not harmonics:
             return cover
         angle = 2 * np.pi * np.flatnonzero(known_lines) / len(known_lines)
-        waves = np.multiply.outer(angle, np.arange(1, harmonics + 1))
-        basis = np.linalg.qr(np.concatenate([np.cos(waves), np.sin(waves)], axis=1))[0]
+        basis = np.linalg.qr(fourier_basis(angle, harmonics)[:, 1:])[0]
         projector = basis @ basis.T
         return projector @ cover @ projector
 

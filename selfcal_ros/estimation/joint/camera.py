@@ -18,6 +18,7 @@ from selfcal_ros.estimation.joint.problem import F_LEVEL, NEGLIGIBLE
 from selfcal_ros.estimation.normal.angular import MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.observability.rank import DETERMINED
+from selfcal_ros.estimation.terms.equations import next_coefficients
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.findings import FewRead, FewReadCell, Finding
@@ -478,8 +479,8 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     coefficients = model.coefficients
     now = model.scored(free, coefficients)
     inverse = free.inverse(noise.sigma)
-    values = coefficients + inverse @ (
-        free.unbiased_sums(now.total) - free.prior(noise.sigma) * coefficients
+    values = next_coefficients(
+        free, now, coefficients, sigma_m=noise.sigma, inverse=inverse
     )
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
     to_map = centred @ inverse[rows]

@@ -116,8 +116,11 @@ class LatticeViews:
     @cached_property
     def in_field(self) -> np.ndarray:
         """Marks inside the field, bool (views, nx, ny)."""
-        (x, y), (nx, ny) = self.from_corner, self.shape
-        return (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+        inside = [
+            (place > -EDGE) & (place < 2 * half + EDGE)
+            for place, half in zip(self.from_corner, self.half, strict=True)
+        ]
+        return inside[0] & inside[1]
 
     @cached_property
     def site_index(self) -> np.ndarray:
@@ -395,31 +398,16 @@ class PlacedViews(LatticeViews):
         """Node positions in the unit, complex (cx, cy)."""
         return self.spline.places_m / (self.unit * self.artifact.grid_pitch_m)
 
-    @property
-    def sites(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Nominal places of the marks in each view, pitches of the plate, (nx, ny) each."""
-        places = self.artifact.places(self.artifact.m, self.artifact.n)
-        return [pose.site_of(*places) for pose in self.poses]
-
-    @cached_property
-    def in_field(self) -> np.ndarray:
-        """Marks inside the field, bool (views, nx, ny)."""
-        return np.array(
-            [
-                ~pose.beyond_field(np.stack(sites), self.artifact)
-                for pose, sites in zip(self.poses, self.sites, strict=True)
-            ]
-        )
-
     @cached_property
     def rows(self) -> tuple[csr_matrix, ...]:
         """Rows of each view's marks on the spline's coefficients, real (marks, nodes); 0 off it."""
-        pitch_m = self.artifact.grid_pitch_m
+        x, y = self.from_corner
+        places = x - self.half[0] + 1j * (y - self.half[1])
         return tuple(
-            self.spline.rows((x + 1j * y).ravel() * pitch_m)
+            self.spline.rows(of_view.ravel() * self.spline.pitch_m)
             .multiply(inside.reshape(-1, 1))
             .tocsr()
-            for inside, (x, y) in zip(self.in_field, self.sites, strict=True)
+            for inside, of_view in zip(self.in_field, places, strict=True)
         )
 
     def gather(self, field: np.ndarray) -> np.ndarray:

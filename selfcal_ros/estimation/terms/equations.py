@@ -500,14 +500,7 @@ class TermEquations:
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
         unit = np.sqrt(np.where(self.free & (diagonal <= GAP), 1.0, diagonal))
         null = np.linalg.qr(unit[:, None] * undetermined)[0]
-        inverse = (
-            np.linalg.pinv(
-                matrix / np.outer(unit, unit) + null @ null.T,
-                hermitian=True,
-                rcond=1e-14,
-            )
-            - null @ null.T
-        )
+        inverse = _inverse_beside(matrix / np.outer(unit, unit), null)
         inverse /= np.outer(unit, unit)
         determined = np.eye(self.n) - undetermined @ undetermined.T
         return determined @ inverse @ determined * np.outer(scale, scale)
@@ -535,6 +528,12 @@ class TermEquations:
             - undetermined @ undetermined.T
         ) / np.outer(norm, norm)
         return out
+
+
+def _inverse_beside(matrix: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Return the inverse of a matrix (k, k) beside what it does not determine, (k, n)."""
+    held = null @ null.T  # held, and let go again
+    return np.linalg.pinv(matrix + held, hermitian=True, rcond=1e-14) - held
 
 
 def equations_of_columns(
@@ -935,14 +934,7 @@ def _estimates_if_free(
     norm = np.hypot(equations.norm, prior)
     scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
     hidden = equations.undetermined(equations.free & other_columns)[other_columns]
-    of_others = (
-        np.linalg.pinv(
-            scaled[np.ix_(other_columns, other_columns)] + hidden @ hidden.T,
-            hermitian=True,
-            rcond=1e-14,
-        )
-        - hidden @ hidden.T
-    )
+    of_others = _inverse_beside(scaled[np.ix_(other_columns, other_columns)], hidden)
     couple = scaled[np.ix_(rows, other_columns)] @ of_others
     scores = equations.unbiased_sums(right) / norm
     information = (
