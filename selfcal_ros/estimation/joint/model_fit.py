@@ -129,10 +129,7 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     found_at = 0
     for number in range(MAX_STEPS):
         change = state.step()
-        largest = max(
-            float(np.abs(state.fitted.parameters).max()), problem.largest_turn_m
-        )
-        if change <= max(ROUNDED * largest, ROUNDING * peak):
+        if change <= max(ROUNDED * state.largest_m, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and 2 * change > before
         small_share = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
@@ -190,19 +187,23 @@ class _State:
         self.y = problem.grid.y
         self.fitted = fit(problem, self.y, self.theta)
         self.offset_steps = LATE
-        self.moved_m, self.changed = (
-            np.zeros(problem.system.size),
-            np.zeros_like(self.y),
-        )
+        self.moved_m = np.zeros(problem.system.size)
+        self.changed = np.zeros_like(self.y)
         self.fell = self.rounds = False
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
         inputs = without_noise(problem.inputs, self.fitted.residuals)
         self._linearise(term_columns(inputs, problem.terms))
         self.coefficients = self.stepped = np.zeros(self.equations.n)
 
+    @property
+    def largest_m(self) -> float:
+        """The largest misalignment, the turns of the frames included, m at the half width."""
+        turned_m = self.problem.half_width_m * self.problem.turn_rad
+        return float(np.abs([*self.fitted.parameters, *turned_m]).max())
+
     def _linearise(self, columns: TermColumns) -> None:
         """Set up the equations of the terms about the present solution."""
-        self.weights, self.ratio = self.fitted.inverse, self.fitted.ratio
+        self.linearised = self.fitted
         self.equations = equations_of(self.problem, self.fitted, columns)
 
     def _refresh(self) -> None:
@@ -227,23 +228,20 @@ class _State:
         effect = columns.shapes.combined(
             self.coefficients, rows
         ) - before.shapes.combined(self.coefficients, rows)
-        largest = max(
-            float(np.abs(self.fitted.parameters).max()), self.problem.largest_turn_m
-        )
-        if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
+        if self.of_offsets and np.abs(effect).max() <= ROUNDED * self.largest_m:
             self.offset_steps = self.steps
         return columns
 
     @property
     def _is_stale(self) -> bool:
         """Whether the weights of angular readings differ from those in the equations."""
-        now = self.fitted.inverse
-        then = self.weights
+        now, then = self.fitted, self.linearised
         if len(self.equations.columns.lines.at) and (
-            abs(self.fitted.ratio - self.ratio) > NEGLIGIBLE * self.ratio
+            abs(now.ratio - then.ratio) > NEGLIGIBLE * then.ratio
         ):
             return True
-        return bool(np.abs(now - then).max() > NEGLIGIBLE * np.abs(then).max())
+        change = np.abs(now.inverse - then.inverse).max()
+        return bool(change > NEGLIGIBLE * np.abs(then.inverse).max())
 
     def step(self) -> float:
         """Take one step; return the largest change of a misalignment or of a reading, m.

@@ -283,11 +283,6 @@ class Problem:
         return self.at_places and self.places is not None
 
     @property
-    def largest_turn_m(self) -> float:
-        """What the largest turn of a frame is at the half width, m."""
-        return self.half_width_m * float(np.abs(self.turn_rad).max(initial=0.0))
-
-    @property
     def to_stage(self) -> np.ndarray:
         """Factor from the turned plate frame of each view's readings to the stage frame."""
         return self.system.grid.views.phases * np.exp(1j * self.turn_rad)

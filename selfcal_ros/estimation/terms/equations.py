@@ -933,6 +933,7 @@ def _estimates_if_free(
     prior = np.where(other_columns, np.sqrt(equations.prior(sigma_m)), 0.0)
     norm = np.hypot(equations.norm, prior)
     scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
+    # the other columns, with their sizes or free, are eliminated
     hidden = equations.undetermined(equations.free & other_columns)[other_columns]
     of_others = _inverse_beside(scaled[np.ix_(other_columns, other_columns)], hidden)
     couple = scaled[np.ix_(rows, other_columns)] @ of_others
@@ -940,6 +941,7 @@ def _estimates_if_free(
     information = (
         scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(other_columns, rows)]
     )
+    # of the rest the combinations that the readings determine
     size, vectors = np.linalg.eigh((information + information.T) / 2)
     determined = size > equations.limit(rows)
     vectors = vectors[:, determined]
