@@ -280,7 +280,7 @@ class Problem:
     @property
     def moves(self) -> bool:
         """Whether readings have the stage error of places other than the sites."""
-        return self.at_places and self.places is not None
+        return self.at_places and self.places is not None and self.places.beside
 
     @property
     def to_stage(self) -> np.ndarray:

@@ -20,8 +20,8 @@ from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
 
 AT_SITES = 1e-5
-"""Distance from the sites, in pitches, at which the stage stands at them: even where its error is a
-micrometre, it is 10 pm off there. Slopes are taken over twice as much."""
+"""Distance from the sites, in pitches, at which the stage is indicated at them: an error of a
+micrometre is 10 pm off there. Slopes are taken over twice as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,11 @@ class StagePlaces:
     def distance(self) -> float:
         """How far the stage stood off the sites, in pitches (rms)."""
         return rms(np.abs(self.away_m)) / self.pitch_m
+
+    @property
+    def beside(self) -> bool:
+        """Whether the stage was indicated beside the sites."""
+        return bool(np.abs(self.away_m).max() > AT_SITES * self.pitch_m)
 
     def true_distance_m(self, error: np.ndarray) -> float:
         """Return how far off the sites the stage with an error (P,), m, truly stood (rms), m."""
@@ -204,7 +209,7 @@ def places_of(
     inputs: TermInputs,
     known_sites: np.ndarray,
 ) -> StagePlaces | None:
-    """Return where the stage stood; None where it stood at the sites, or no visit tells.
+    """Return where the stage stood; None where no visit tells.
 
     Parameters
     ----------
@@ -240,7 +245,7 @@ def places_of(
         about.append(offset_from_target - mean[visits.mark])
     located &= views.near(known_sites) & (grid.weight > 0)
     pitch_m = inputs.half_width_m / views.unit * views.node_pitch
-    if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
+    if not located.any():
         return None
     return StagePlaces(
         views=views,

@@ -134,10 +134,11 @@ def test_beyond_the_outermost_sites_the_spline_goes_on():
     )
 
 
-def test_a_stage_that_stands_at_its_sites_has_no_places():
-    assert found_in(readings(stands(0.0, 0.9e-7) * 0.004)) is None
-    assert found_in(readings(stands(0.0, 0.0))) is None  # as the mean of its visits
-    assert found_in(readings(stands(0.0, 1.1e-7))) is not None
+def test_a_stage_is_beside_its_sites_or_no_visit_tells():
+    assert not found_in(readings(stands(0.0, 0.9e-7) * 0.004)).beside
+    # as the mean of its visits
+    assert not found_in(readings(stands(0.0, 0.0))).beside
+    assert found_in(readings(stands(0.0, 1.1e-7))).beside
     whole = readings(stands(1e-3, 0.0))
     none = tuple(replace(view, visits=None) for view in whole.views)
     assert found_in(replace(whole, views=none)) is None

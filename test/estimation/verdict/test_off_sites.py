@@ -49,9 +49,13 @@ def readings(
     seed=1,
     visits=True,
     sigma_m=SIGMA_M,
+    indicated=False,
     **stage,
 ):
-    """Return what a stage reads that goes to the marks as they lie, or to their sites."""
+    """Return what a stage reads that goes to the marks as they lie, or to their sites.
+
+    Truly, or as it indicates itself.
+    """
     rng, views = np.random.default_rng(seed), []
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     m, n = (array.ravel() for array in np.meshgrid(STEPS, STEPS, indexing="ij"))
@@ -61,10 +65,12 @@ def readings(
         site = turned[:, here] * PITCH_M
         # a plate without errors, laid down beside its place
         mark = site + beside[:, None]
-        true = sign * (mark if follow else site)
-        indicated = true + stage_error(*true, **stage)
+        true = target = sign * (mark if follow else site)
+        for _ in range(20 * indicated):
+            true = target - stage_error(*true, **stage)
+        indication = true + stage_error(*true, **stage)
         seen = mark - sign * true + rng.normal(0, sigma_m, mark.shape)
-        dx, dy = sign * indicated + seen - site
+        dx, dy = sign * indication + seen - site
         count = np.ones(here.sum(), dtype=int)
         at = GridVisits(
             np.arange(here.sum()),
@@ -165,6 +171,19 @@ def test_a_stage_that_is_rough_there_has_a_larger_u(sense):
         "a stage that stood 0.567 mm off the sites, where its error "
     )
     assert "place the plate closer to its nominal pose" in cause.text
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_a_stage_that_is_exactly_at_the_sites_by_its_own_indication_is_told(sense):
+    """Its error of 10 um moves it off them, where it differs by 20 nm."""
+    steep = {"rough_m": 1e-5}
+    whole = readings(
+        follow=False, sense=sense, beside=0 * BESIDE_M, indicated=True, **steep
+    )
+    result = calibrate(whole, BARE)
+    assert abs(error_of(result, **steep)).max() > 2e-8
+    assert result.verdict.grade is not Grade.GOOD
+    assert [cause.name for cause in result.verdict.causes] == ["off_sites"]
 
 
 def test_how_far_off_the_sites_is_where_the_stage_truly_stood():
