@@ -144,9 +144,12 @@ class NodeBase[S: Settings](Answering):
             if topic.qos.depth > 1:
                 self.losses.add(topic.name, event.total_count_change)
 
-        # no default callbacks: one due when a subscription ends would end the process (rclpy 1644)
+        # no default callbacks: one due when a subscription ends would end the process (rclpy 1644).
+        # none of lost messages where numbers tell of them: taken while more are lost, it locks the
+        # node for ever, deaf to signals (rmw_fastrtps 890)
+        numbered = getattr(callback, "counts_losses", False)
         events = SubscriptionEventCallbacks(
-            message_lost=lost, use_default_callbacks=False
+            message_lost=None if numbered else lost, use_default_callbacks=False
         )
         return self.own(
             self.create_subscription(

@@ -46,6 +46,7 @@ class ByTheClock:
     """
 
     __signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
+    counts_losses = True
 
     def __init__(
         self,

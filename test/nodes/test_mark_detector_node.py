@@ -114,6 +114,14 @@ def test_images_that_were_overwritten_are_counted(graph, bag):
     assert "messages lost" in node.losses.diagnosis().message
 
 
+def test_no_event_of_lost_images_is_taken(graph):
+    """Taken while more are lost, it may lock the node for ever (rmw_fastrtps 890)."""
+    node = graph.node(MarkDetectorNode, **PARAMETERS)
+    graph.publisher(names.image_topics("raw", 100)[0])
+    (found,) = (s for s in node.subscriptions if s.topic_name.endswith("/stage/image"))
+    assert not found.event_handlers
+
+
 def test_without_the_size_of_a_pixel_it_says_so(graph):
     with pytest.raises(Exception, match="pixel_size: is not set"):
         graph.node(MarkDetectorNode, mark_size=5e-5)
