@@ -154,13 +154,17 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         """Undo everything; the node can be configured again."""
         return self._unmake("activate", "configure")
 
+    def close(self) -> None:
+        """Undo everything, and finish its work with that: what waits is taken, files are ended."""
+        self._unmake("activate", "configure")
+
     def destroy_node(self) -> None:
         """Undo everything, and remove the name from the graph.
 
         rclpy 7.1 leaves the state machine, which references the node: until garbage
         collection the name would stay in the graph, without any topic.
         """
-        self._unmake("activate", "configure")
+        self.close()
         super().destroy_node()
         self._is_gone = True  # a state machine used after its end ends the process
         self._state_machine.destroy_when_not_in_use()

@@ -12,6 +12,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 
 import rclpy
@@ -119,6 +120,9 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     except SelfcalError as error:
         print(f"selfcal: {error}", file=sys.stderr)
         code = int(error.exit_code)
+    except Exception:  # told before the middleware can hang
+        traceback.print_exc()
+        code = int(ExitCode.INTERNAL)
     finally:
         if node is not None:
             getattr(node, "close", lambda: None)()
@@ -157,20 +161,22 @@ def ended_at_the_latest(code: int) -> Iterator[None]:
 
     Where many nodes end at once, Fast DDS 2.14 with an older libstdc++ (as in the wheels) can wait
     for a minute for a callback that it keeps from ending (eProsima/Fast-DDS 6513). rclpy holds the
-    lock of the interpreter meanwhile: no thread of Python could end the process. What other nodes
-    see of this one has gone before.
+    lock of the interpreter meanwhile: no thread of Python could end the process. By then other
+    nodes no longer see this one. Where there is no such timer, `ENDS_S` is left.
     """
     libc = ctypes.CDLL(None)
-    if not hasattr(libc, "timer_create"):  # macOS
-        yield
-        return
     notice = Notice(
         value=code,
         kind=SIGEV_THREAD,
         function=ctypes.cast(libc._exit, ctypes.c_void_p),
     )
     timer = ctypes.c_void_p()
-    libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(notice), ctypes.byref(timer))
+    make = getattr(libc, "timer_create", None)  # not on macOS
+    if make is None or make(
+        time.CLOCK_MONOTONIC, ctypes.byref(notice), ctypes.byref(timer)
+    ):
+        yield
+        return
     # seconds and nanoseconds: of the period (once only), of the delay
     delay = (ctypes.c_long * 4)(0, 0, *divmod(int(LEAVES_S * 1e9), 10**9))
     libc.timer_settime(timer, 0, ctypes.byref(delay), None)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a node runs as a process."""
 
+import contextlib
 import gc
 import subprocess
 import sys
@@ -99,17 +100,69 @@ running.LEAVES_S = 0.2
 with running.ended_at_the_latest(3):
     pass
 time.sleep(0.5)
-with running.ended_at_the_latest(0):
+with running.ended_at_the_latest(CODE):
     ctypes.PyDLL(None).sleep(60)  # holds the lock of the interpreter
 raise SystemExit(4)
 """
 
 
-def test_a_middleware_that_hangs_when_the_work_is_done_does_not_change_the_code():
+@pytest.mark.parametrize("code", [0, 5])
+def test_a_middleware_that_hangs_when_the_work_is_done_does_not_change_the_code(code):
     done = subprocess.run(
-        [sys.executable, "-c", LEAVING], check=False, timeout=50, capture_output=True
+        [sys.executable, "-c", LEAVING.replace("CODE", str(code))],
+        check=False,
+        timeout=50,
+        capture_output=True,
     )
-    assert (done.returncode, done.stderr) == (0, b"")
+    assert (done.returncode, done.stderr) == (code, b"")
+
+
+@pytest.fixture
+def runs_alone(monkeypatch):
+    """Let `running.run` run a node of its own, without ROS and signals."""
+    for name in ("complete_on_signal", "_init", "spin"):
+        monkeypatch.setattr(running, name, lambda *_: None)
+    monkeypatch.setattr(running, "ignore_signals", lambda: None)
+    monkeypatch.setattr(running, "rclpy", SimpleNamespace(try_shutdown=lambda: None))
+
+
+@pytest.mark.usefixtures("runs_alone")
+def test_only_leaving_the_graph_has_a_limit(monkeypatch):
+    """The work at the end, as of images that wait, may take longer."""
+    limited: list[str] = []
+
+    @contextlib.contextmanager
+    def limit(code):
+        limited.append(f"begin {code}")
+        yield
+        limited.append("end")
+
+    monkeypatch.setattr(running, "ended_at_the_latest", limit)
+    node = SimpleNamespace(
+        close=lambda: limited.append("work"),
+        destroy_node=lambda: limited.append("leave"),
+    )
+    assert running.run(lambda: node) == 0
+    assert limited == ["work", "begin 0", "leave", "end"]
+
+
+@pytest.mark.usefixtures("runs_alone")
+def test_a_crash_is_told_and_has_its_code_before_the_middleware_ends(
+    monkeypatch, capsys
+):
+    codes: list[int] = []
+    monkeypatch.setattr(
+        running,
+        "ended_at_the_latest",
+        lambda code: contextlib.nullcontext(codes.append(code)),
+    )
+
+    def crash():
+        raise RuntimeError("no such thing")
+
+    assert running.run(crash) == 1
+    assert codes == [1]
+    assert "RuntimeError: no such thing" in capsys.readouterr().err
 
 
 def test_messages_that_were_built_before_a_field_was_added_are_one_line(

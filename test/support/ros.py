@@ -117,7 +117,8 @@ class Graph:
         )
 
     def close(self) -> None:
-        # beside the end of other nodes this one may hang (see nodes/running.py)
+        # messages of other nodes' end have come by then: beside them a node may hang
+        # (nodes/running.py)
         time.sleep(0.02)
         for node in list(self.nodes):
             self.remove(node)
