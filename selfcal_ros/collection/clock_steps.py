@@ -15,7 +15,9 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 GROUP, BESIDE = 5, 3
-"""Messages per group, those of one stamp as one, and groups compared on each side of a step."""
+"""Messages per group, and groups compared on either side of a step."""
+REMEMBERED = 10_000
+"""Last stamps with which those of messages that may be sent again are compared."""
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
 REMEDY = (
@@ -23,7 +25,7 @@ REMEDY = (
     "the start)"
 )
 Span = tuple[np.ndarray, np.ndarray]
-"""Lowest and highest of offset, stamp and reception, each (3, n)."""
+"""Lowest and highest of offset, stamp, reception and whether sent again, each (4, n)."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,10 @@ class StepWatch:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_ns = round(limit_s * NS_PER_S)
-        self._last_ns = np.zeros(1, dtype=np.int64)  # the newest stamp
-        self._rest = np.zeros((2, 0), dtype=np.int64)  # an incomplete group
-        self._groups = np.zeros((6, 0), dtype=np.int64)
+        self._first_ns: int | None = None
+        self._remembered_ns = np.zeros(0, dtype=np.int64)
+        self._rest = np.zeros((3, 0), dtype=np.int64)  # an incomplete group
+        self._groups = np.zeros((8, 0), dtype=np.int64)
         self._nearest: tuple[int, int] | None = None  # largest offset, and its time
         self._quiet = 0  # groups still affected by a reported step
 
@@ -73,17 +76,17 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
-        # the marks of an image tell of one exposure
-        first = np.diff(stamps_ns, prepend=self._last_ns) != 0
-        self._last_ns = np.append(self._last_ns, stamps_ns)[-1:]
-        messages = np.concatenate(
-            [self._rest, np.stack([stamps_ns, received_ns])[:, first]], axis=1
-        )
+        new = np.stack([stamps_ns, received_ns, self._sent_again(stamps_ns)])
+        if self._first_ns is None and len(stamps_ns):
+            self._first_ns = int(stamps_ns[0])
+        # a detector takes longer for its first image than for any other
+        new = new[:, stamps_ns != self._first_ns]
+        messages = np.concatenate([self._rest, new], axis=1)
         n_grouped = messages.shape[1] // GROUP * GROUP
         self._rest = messages[:, n_grouped:]
         if not n_grouped:
             return []
-        stamps, received = messages[:, :n_grouped].reshape(2, -1, GROUP)
+        stamps, received, again = messages[:, :n_grouped].reshape(3, -1, GROUP)
         offset = stamps - received
         self._groups = np.concatenate(
             [
@@ -91,7 +94,7 @@ class StepWatch:
                 np.stack(
                     [
                         column
-                        for values in (offset, stamps, received)
+                        for values in (offset, stamps, received, again)
                         for column in (values.min(axis=1), values.max(axis=1))
                     ]
                 ),
@@ -101,6 +104,18 @@ class StepWatch:
         steps = self._look()
         self._groups = self._groups[:, -2 * BESIDE :]
         return steps
+
+    def _sent_again(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return which messages bear a stamp from before the last change of stamps, (n,)."""
+        known = np.concatenate([self._remembered_ns, stamps_ns])
+        self._remembered_ns = known[-REMEMBERED:]
+        changes = np.diff(known, prepend=known[:1] - 1) != 0
+        if not (np.diff(known) < 0).any():
+            return np.zeros(len(stamps_ns), dtype=bool)
+        number = np.arange(len(known))
+        since = np.maximum.accumulate(np.where(changes, number, 0))
+        _, first, same = np.unique(known, return_index=True, return_inverse=True)
+        return (first[same] < since)[len(known) - len(stamps_ns) :]
 
     def _look(self) -> list[ClockStep]:
         """Return the steps within a group with neighbours on both sides."""
@@ -141,10 +156,11 @@ class StepWatch:
 
         Parameters
         ----------
-        before : int array (3,)
-            Highest offset, stamp and reception of the next messages, ns.
+        before : int array (4,)
+            Highest offset, stamp and reception of the next messages, ns, and whether one was sent
+            again.
         """
-        offset_ns, _, received_ns = before.tolist()
+        offset_ns, _, received_ns, _ = before.tolist()
         if self._nearest is not None:
             nearest_ns, when = self._nearest
             offset_ns = max(offset_ns, nearest_ns - max(received_ns - when, 0) // SLEW)
@@ -169,7 +185,7 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
         (highest[1] - lowest[1]) - (highest[2] - lowest[2]) > limit_ns // 2
         for lowest, highest in (before, after)
     )
-    sent_again = next_outrun & ~outrun
+    sent_again = next_outrun & ~outrun & (next_high[3] > 0)
     back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2) & ~sent_again
     # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])

@@ -57,6 +57,36 @@ def test_the_limit(by_ns, number):
     assert len(found(stepped(1500, by_ns), TRUE)) == number
 
 
+@pytest.mark.parametrize("at", [5, 30, 55])
+@pytest.mark.parametrize(
+    ("period_ns", "by_ns"),
+    [
+        (S // 10, -5 * S),
+        (S // 10, -S // 2),
+        (S // 10, S // 2),
+        (2 * S, -5 * S),
+        (2 * S, S // 2),
+        (2 * S, 5 * S),
+    ],
+)
+def test_a_step_is_found_in_images_of_many_marks(period_ns, at, by_ns):
+    """Sixty images of 25 marks each, which share a stamp; back by more than their period."""
+    exposed = TRUE[0] + np.arange(60) * period_ns
+    stamps = exposed + np.where(np.arange(60) >= at, by_ns, 0)
+    late = np.random.default_rng(at).uniform(10 * MS, 30 * MS, 60).astype(int)
+    (step,) = found(np.repeat(stamps, 25), np.repeat(exposed + late, 25))
+    assert abs(step.by_ns - by_ns) < 30 * MS
+
+
+@pytest.mark.parametrize("by_ns", [-S, -5 * S])
+@pytest.mark.parametrize("bundle", [100, 300, 1000])
+def test_a_step_back_beside_messages_that_come_at_once_is_found(by_ns, bundle):
+    """They are not sent again: no stamp was seen before."""
+    received = TRUE + MS
+    received[1500 : 1500 + bundle] = received[1500 + bundle]
+    assert found(stepped(1500, by_ns + MS), received)
+
+
 @pytest.mark.parametrize("received", [0, TRUE[0]])
 def test_a_reception_that_stands_still_tells_of_no_step(received):
     """A pause between two views is none."""
