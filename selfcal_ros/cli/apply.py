@@ -117,7 +117,8 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
         With the field, and the question whether the points are in mm.
     """
     places = points.reshape(-1, 2) if points.shape[1] == len(ENDS) else points[:, :2]
-    places = places[places.any(axis=1)]
+    is_origin = ~places.any(axis=1)
+    places = places[~is_origin]
     plate = stage.error_map.artifact
     half = np.array(plate.half) * plate.grid_pitch_m
     beyond = (np.abs(places) / half).max(axis=1, initial=0.0)
@@ -127,8 +128,9 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
     farthest = places[beyond.argmax()]
     raise InputError(
         where,
-        f"all points but the origin lie outside the field (x from {-x:g} to {x:g} mm, y from "
-        f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in mm?",
+        f"all points{' but the origin' * bool(is_origin.any())} lie outside the field (x from "
+        f"{-x:g} to {x:g} mm, y from {-y:g} to {y:g} mm), up to ({farthest[0]:g}, "
+        f"{farthest[1]:g}) m: is it in mm?",
         "give positions in m, in the stage frame",
     )
 

@@ -157,15 +157,23 @@ def run(args: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedPlan:
     """What is known of a plan before anything moves.
 
     Attributes
     ----------
+    assumed : Assumed
+        Noise and sizes that the budget goes by.
+    model : tuple of ModelTerm
+        Declared terms.
     check : PlanCheck
         Rank and unseen modes, those of the declared terms among them.
     alone, joint : Prediction or None
-        Without and with the declared terms; None if the plan does not identify the stage.
+        Without and with the declared terms; None if the plan then does not identify the stage.
+    terms : sequence of TermCheck
+        What the plan shows of each declared term.
+    budget : PlanBudget or None
+        None if the plan does not identify the stage.
     """
 
     plan: Plan
@@ -188,7 +196,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
     return int(ExitCode.DONE if identifiable else ExitCode.NOT_IDENTIFIABLE)
 
 
-def _judged(args: argparse.Namespace, plan: Plan) -> Judged:
+def _judged(args: argparse.Namespace, plan: Plan) -> JudgedPlan:
     assumed, sizes = plan_terms.assumed_of(args), plan_terms.sizes_of(args)
     declared = plan_terms.declared_of(args, plan)
     model = tuple(term for term in declared if term.size > 0)
@@ -211,7 +219,7 @@ def _judged(args: argparse.Namespace, plan: Plan) -> Judged:
                 plan, terms, assumed, alone, declared=[term.name for term in declared]
             )
     checked = replace(checked, observability=worded_observability(observability))
-    return Judged(plan, assumed, model, checked, alone, joint, checks, budget)
+    return JudgedPlan(plan, assumed, model, checked, alone, joint, checks, budget)
 
 
 def _repeated(plan: Plan, repeats: int | None) -> Plan:
@@ -249,7 +257,7 @@ def _with_terms(
     return observability, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
-def _json_of(args: argparse.Namespace, judged: Judged) -> dict[str, Any]:
+def _json_of(args: argparse.Namespace, judged: JudgedPlan) -> dict[str, Any]:
     checked, observability = judged.check, judged.check.observability
     return {
         "plan_id": judged.plan.plan_id,
@@ -274,7 +282,7 @@ def _json_of(args: argparse.Namespace, judged: Judged) -> dict[str, Any]:
 
 
 def _predicted_json(
-    args: argparse.Namespace, judged: Judged, alone: Prediction
+    args: argparse.Namespace, judged: JudgedPlan, alone: Prediction
 ) -> dict[str, Any]:
     """Return factors of the noise of an averaged reading; with ``--sigma`` µm as well."""
     joint = judged.joint
@@ -306,7 +314,7 @@ def _predicted_json(
     return plain(out)
 
 
-def _text_of(args: argparse.Namespace, judged: Judged) -> list[str]:
+def _text_of(args: argparse.Namespace, judged: JudgedPlan) -> list[str]:
     plan, assumed = judged.plan, judged.assumed
     alone, joint = judged.alone, judged.joint
     in_um = args.sigma is not None

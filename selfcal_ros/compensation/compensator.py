@@ -228,7 +228,8 @@ class Compensator:
         value whatever the correlation of the sites. The bicubic value for sites with equal and
         independent errors stays within it to 1 %, except in the outermost cells, where it may
         exceed it by 37 %. In quadrature to it the error of interpolation between the sites, from
-        the map's own curvature (method eq. 1.7), unless the map was estimated with it.
+        the map's own curvature and edges (method eqs. 1.7, 1.8), unless the map was estimated
+        with it.
 
         Raises
         ------

@@ -298,21 +298,21 @@ def error_halfway(
 def error_at_edges(values: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return the error halfway in the first and last cell that the edge node alone feels, (2,).
 
-    An error that begins within the last cell makes the last node depart from its course. Where it
-    begins no reading shows, so nothing is taken to shrink from two pitches to one. 0 unless the
-    departure is beyond all that occur inside.
+    An error that begins within the last cell makes the last node depart from its course. No
+    reading shows where it begins, so nothing is taken to shrink from two pitches to one. 0 unless
+    the departure is beyond all that occur inside.
 
     Parameters
     ----------
     values, u : float array (n, ...)
         As for `error_halfway`.
     """
+    if len(values) - 2 < FEWEST_ROWS:
+        return np.zeros(2)
     square, noise = (
         part.reshape(len(part), -1)
         for part in _departures(values, u, _LINEAR, 1, ring=False)
     )
-    if len(square) < FEWEST_ROWS:
-        return np.zeros(2)
     unknown = ~np.isfinite(square - noise)
     square, noise = (
         np.ma.masked_array(part, unknown).mean(axis=1).filled(0.0)

@@ -109,7 +109,7 @@ def test_tables_of_controllers_have_the_nodes_at_their_places(said):
             "--unit",
             "mm",
             "--verify",
-            *counts,
+            *(counts if kind == "pmac" else ()),
         )
     emap = read_json("one.json")["error_map"]
     gx, gy = np.array(emap["gx"]), np.array(emap["gy"])

@@ -49,7 +49,8 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
 
 
 def test_a_reference_far_from_the_encoders_is_a_warning(tmp_path):
-    solved(tmp_path, "--reference", "artifact:1.2e-3:1e-7")
+    # so far off, the stage stood 0.05 mm beside the sites at which it is indicated
+    solved(tmp_path, "--reference", "artifact:1.2e-3:1e-7", code=5)
     (warning,) = json.loads((tmp_path / "r.json").read_text())["warnings"][:1]
     assert warning.startswith("by the reference length the encoders indicate lengths ")
     assert "shorter than they are by 1200" in warning

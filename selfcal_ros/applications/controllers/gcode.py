@@ -393,10 +393,10 @@ class Rewriter:
         return lines
 
     def _travels(self, act: Code, line: ProgramLine) -> bool:
-        """Return whether the way of a move counts for nothing, only where it ends."""
-        without_extruder = act.does == "line" and not line.named("E")
-        prints_nothing = self.prints or (self._printer and act.name == "G0")
-        return act.does in ("rapid", "hole") or (without_extruder and prints_nothing)
+        """Return whether only the end of a move matters, not its path."""
+        extrudes_nothing = act.does == "line" and not line.named("E")
+        on_a_printer = self.prints or (self._printer and act.name == "G0")
+        return act.does in ("rapid", "hole") or (extrudes_nothing and on_a_printer)
 
     def _reach(self, path_m: np.ndarray) -> None:
         """Widen the field of the program by a path."""

@@ -198,7 +198,7 @@ def scale_texts(result: CalibrationResult) -> list[str]:
 def distance_text(stage: StageMap, a: float, b: float) -> str:
     """Return the statement U = a + b L on distances in the field, a in m and b in m/m."""
     nodes = ""
-    if stage.halfway.any():
+    if stage.halfway.any() or stage.edges.any():
         a_nodes, b_nodes = stage.length_uncertainty(anywhere=False)
         nodes = (
             f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "

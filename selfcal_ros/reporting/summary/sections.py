@@ -11,7 +11,7 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import (
     ErrorMap,
     ThetaDatum,
@@ -373,7 +373,10 @@ def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
 def _edges(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return the outermost rows of nodes that depart from the course of those inside."""
     emap = result.error_map
-    if result.reads_between_nodes:
+    is_fitted = result.interpolation == Interpolation.BILINEAR or (
+        result.interpolation == Interpolation.BICUBIC and emap.valid.all()
+    )
+    if is_fitted and result.reads_between_nodes:
         return []
     artifact, facts = emap.artifact, []
     edges = along_axes(error_at_edges, emap)
@@ -387,8 +390,8 @@ def _edges(result: CalibrationResult) -> list[tuple[str, str]]:
             (
                 f"edge {'xy'[axis]} {at} mm",
                 f"G{'xy'[of]} departs by {um(2 * edges[of, axis, side])} from its course inside: "
-                f"U is as large between {'xy'[axis]} {next_to_last} and {at} mm; let the field "
-                "end where the stage runs freely",
+                f"U is up to about as large between {'xy'[axis]} {next_to_last} and {at} mm; let "
+                "the field end where the stage runs freely",
             )
         )
     return facts

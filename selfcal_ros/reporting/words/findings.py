@@ -247,7 +247,7 @@ _ACTIONS = {
     "lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, send the stage to the sites, or "
-    "correct it by this map and measure again",
+    "correct the stage by this map and measure again",
     "roughness": "give the map more nodes, or harmonics if it is the angular one (map in the "
     "plan), and views at other turns and shifts",
     "noise": "measure the view again, and look for a source of vibration",

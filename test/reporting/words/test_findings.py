@@ -367,8 +367,8 @@ CAUSES = [
             details=CauseDetails(away=4.1e-4),
         ),
         "a stage that stood 0.41 mm off the sites, where its error differs by 0.0200 ± 0.0010 µm: "
-        "place the plate closer to its nominal pose, send the stage to the sites, or correct it "
-        "by this map and measure again",
+        "place the plate closer to its nominal pose, send the stage to the sites, or correct "
+        "the stage by this map and measure again",
     ),
     *(
         (
