@@ -76,11 +76,9 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
-        new = np.stack([stamps_ns, received_ns, self._sent_again(stamps_ns)])
         if self._first_ns is None and len(stamps_ns):
             self._first_ns = int(stamps_ns[0])
-        # a detector takes longer for its first image than for any other
-        new = new[:, stamps_ns != self._first_ns]
+        new = np.stack([stamps_ns, received_ns, self._sent_again(stamps_ns)])
         messages = np.concatenate([self._rest, new], axis=1)
         n_grouped = messages.shape[1] // GROUP * GROUP
         self._rest = messages[:, n_grouped:]
@@ -138,8 +136,12 @@ class StepWatch:
                 self._quiet -= 1
                 continue
             nearest, when = self._nearest_so_far(before[1][:, number])
-            # by at least half of it: the rest may be a delay that ended
-            ahead = offset[number] - nearest > max(self._limit_ns, size[number]) // 2
+            # by at least half of it: the rest may be a delay that ended; a detector takes longer
+            # for its first image than for any other
+            is_first = before[1][1, number] == self._first_ns
+            ahead = not is_first and (
+                offset[number] - nearest > max(self._limit_ns, size[number]) // 2
+            )
             if size[number] < 0 or (size[number] and ahead):
                 # of the groups affected, the middle one contains the step
                 last = min(number + BESIDE, count)
