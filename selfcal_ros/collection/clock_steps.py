@@ -17,7 +17,7 @@ from selfcal_ros.units import NS_PER_S, S_PER_NS
 GROUP, BESIDE = 5, 3
 """Messages per group, and groups compared on either side of a step."""
 REMEMBERED = 10_000
-"""Last stamps with which those of messages that may be sent again are compared."""
+"""Messages within which one that is sent again is known by its stamp."""
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
 REMEDY = (
@@ -104,16 +104,22 @@ class StepWatch:
         return steps
 
     def _sent_again(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return which messages bear a stamp from before the last change of stamps, (n,)."""
+        """Return which messages bear a stamp from before the last change of stamps, (n,).
+
+        The answer does not depend on the pieces in which messages come.
+        """
         known = np.concatenate([self._remembered_ns, stamps_ns])
-        self._remembered_ns = known[-REMEMBERED:]
-        changes = np.diff(known, prepend=known[:1] - 1) != 0
-        if not (np.diff(known) < 0).any():
+        self._remembered_ns = known[-2 * REMEMBERED :]
+        changes = np.diff(known)
+        if not (changes < 0).any():
             return np.zeros(len(stamps_ns), dtype=bool)
-        number = np.arange(len(known))
-        since = np.maximum.accumulate(np.where(changes, number, 0))
-        _, first, same = np.unique(known, return_index=True, return_inverse=True)
-        return (first[same] < since)[len(known) - len(stamps_ns) :]
+        order = np.argsort(known, kind="stable")
+        alike = known[order[1:]] == known[order[:-1]]
+        ago = np.full(len(known), REMEMBERED + 1)
+        ago[order[1:][alike]] = np.diff(order)[alike]
+        begins = np.r_[True, changes != 0]
+        since = np.maximum.accumulate(np.where(begins, np.arange(len(known)), 0))
+        return (ago[since] <= REMEMBERED)[len(known) - len(stamps_ns) :]
 
     def _look(self) -> list[ClockStep]:
         """Return the steps within a group with neighbours on both sides."""

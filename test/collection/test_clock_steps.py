@@ -87,6 +87,17 @@ def test_a_step_back_beside_messages_that_come_at_once_is_found(by_ns, bundle):
     assert found(stepped(1500, by_ns + MS), received)
 
 
+@pytest.mark.parametrize("pieces", [1, 7, 600])
+@pytest.mark.parametrize(("ago", "number"), [(5_000, 0), (15_000, 2)])
+def test_what_is_sent_again_is_known_alike_in_any_pieces(ago, number, pieces):
+    """Live as from the file; what is older than the last messages is not known again."""
+    stamps = TRUE[0] + np.arange(20_000) * 5 * MS
+    again = stamps[-ago:][:60]
+    sent = np.r_[stamps, again, stamps[-1] + 5 * MS * np.arange(1, 61)]
+    received = np.r_[stamps + MS, np.full(60, stamps[-1] + 2 * MS), sent[-60:] + MS]
+    assert len(found(sent, received, pieces=pieces)) == number
+
+
 @pytest.mark.parametrize("received", [0, TRUE[0]])
 def test_a_reception_that_stands_still_tells_of_no_step(received):
     """A pause between two views is none."""
