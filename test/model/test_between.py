@@ -110,6 +110,33 @@ def test_an_error_that_begins_within_the_last_cell_is_within_u(size, rise_m, beg
     assert not edges.any()
 
 
+@pytest.mark.parametrize("method", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("of", [0, 1])
+def test_each_edge_of_a_rectangular_field_is_that_of_its_own_cells(
+    of, axis, side, method
+):
+    """Gx or Gy departs at the first or last of 7 columns or 9 rows; U is larger there alone."""
+    artifact = Artifact(7, PITCH_M, grid_size_y=9)
+    g = np.zeros((2, *artifact.shape))
+    np.moveaxis(g[of], axis, 0)[-side] = 1e-6
+    u = np.full(artifact.shape, 1e-9)
+    used = Compensator(
+        ErrorMap(artifact, *g, u, u, np.zeros(0), np.zeros(0)), method=method
+    )
+    assert list(zip(*used.edges.nonzero(), strict=True)) == [(of, axis, side)]
+    edge = np.zeros(2)
+    edge[axis] = (2 * side - 1) * (artifact.half[axis] - 0.5)
+    across = np.zeros(2)
+    across[1 - axis] = artifact.half[1 - axis] - 0.5
+    at_edge, opposite, beside = (
+        used.uncertainty(*(place * PITCH_M))[of] for place in (edge, -edge, across)
+    )
+    assert at_edge > 0.45e-6
+    assert max(opposite, beside) < at_edge / 2
+
+
 @pytest.mark.parametrize("noise_m", [1e-9, 3e-8, 3e-7])
 @pytest.mark.parametrize(("size", "pitches"), [(5, 5), (6, 5), (7, 4), (9, 8), (13, 4)])
 def test_the_edges_of_smooth_stages_have_no_size_of_their_own(size, pitches, noise_m):
