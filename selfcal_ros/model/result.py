@@ -15,7 +15,7 @@ import numpy as np
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.budget import BudgetLine, budget_from_list, line_to_dict
 from selfcal_ros.model.camera import (
     CameraErrors,
@@ -256,6 +256,18 @@ class CalibrationResult:
             if v.read_grid is None or np.any(v.read_grid)
         )
         return reads_between_nodes(views, self.plate)
+
+    @property
+    def is_fitted_between_nodes(self) -> bool:
+        """Whether u of the nodes contains what the map lacks between them, as it is used.
+
+        A spline needs all of its nodes: with an unknown one the map is used linearly.
+        """
+        used_as_fitted = self.interpolation == Interpolation.BILINEAR or (
+            self.interpolation == Interpolation.BICUBIC
+            and bool(self.error_map.valid.all())
+        )
+        return used_as_fitted and self.reads_between_nodes
 
     @property
     def has_uncertainty(self) -> bool:

@@ -550,15 +550,13 @@ def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetL
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     """Estimate the error of interpolation; none where readings between the nodes show it.
 
-    It is then lack of fit, part of the uncertainty at the nodes. A spline needs all of its nodes:
-    with an unknown one the map is used linearly.
+    It is then lack of fit, part of the uncertainty at the nodes.
     """
+    if result.is_fitted_between_nodes:
+        return _interpolation("xy", 0.0, 0.0)
     emap = result.error_map
-    is_linear = result.interpolation == Interpolation.BILINEAR
     all_known = bool(emap.valid.all())
     is_spline = all_known and result.interpolation == Interpolation.BICUBIC
-    if (is_linear or is_spline) and result.reads_between_nodes:
-        return _interpolation("xy", 0.0, 0.0)
     errors = along_axes(partial(error_halfway, cubic=is_spline), emap) ** 2
     edges = along_axes(error_at_edges, emap) ** 2
     cells = np.array(emap.valid.shape) - 1

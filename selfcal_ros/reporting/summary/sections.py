@@ -11,7 +11,7 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import (
     ErrorMap,
     ThetaDatum,
@@ -373,10 +373,7 @@ def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
 def _edges(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return the outermost rows of nodes that depart from the course of those inside."""
     emap = result.error_map
-    is_fitted = result.interpolation == Interpolation.BILINEAR or (
-        result.interpolation == Interpolation.BICUBIC and emap.valid.all()
-    )
-    if is_fitted and result.reads_between_nodes:
+    if result.is_fitted_between_nodes:
         return []
     artifact, facts = emap.artifact, []
     edges = along_axes(error_at_edges, emap)
