@@ -286,14 +286,13 @@ class StageMap(Compensator):
         """Return a in m and b in m/m: U of a distance L in the field is at most a + b L.
 
         With the coverage factor of the map, 95.45 %. Of a larger field every second, third, ...
-        node stands for its neighbours; of a bicubic map also points halfway between nodes, since
-        in the outermost cells its uncertainty is larger than at the nodes.
+        place stands for its neighbours.
 
         Parameters
         ----------
         anywhere : bool
-            Whether the ends lie anywhere in the field, with the error of interpolation halfway
-            between nodes along x and y, where it is largest. Otherwise both are nodes.
+            Whether the ends lie anywhere in the field: at nodes and halfway between them, where
+            the error of interpolation is largest. Otherwise both are nodes.
 
         Raises
         ------
@@ -302,7 +301,7 @@ class StageMap(Compensator):
         """
         from scipy.optimize import linprog  # a third of a second, for this alone
 
-        x, y = self._places(between=anywhere and self.method == "bicubic")
+        x, y = self._places(between=anywhere)
         i, j = np.triu_indices(len(x), 1)
         if not len(i):
             raise InputError(
@@ -324,9 +323,6 @@ class StageMap(Compensator):
             * ey
             * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n] - cover[j, i + n])
         )
-        if anywhere:
-            worst = (self.halfway**2 + self.edges.max(axis=2) ** 2).sum(axis=1)
-            square += 2 * (ex**2 * worst[0] + ey**2 * worst[1])
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
         solution = linprog(
@@ -339,7 +335,7 @@ class StageMap(Compensator):
     def _places(self, *, between: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y of at most about `MOST_NODES` known nodes along a side, m, (P,).
 
-        With `between`, of points halfway between them too.
+        With `between`, also of points halfway between them whose neighbours are known.
         """
         plate = self.error_map.artifact
         if not between:
@@ -355,8 +351,9 @@ class StageMap(Compensator):
             step = -(-last // MOST_NODES) | 1
             halves = np.unique([*range(0, last, step), 1, last - 1, last])
             sides.append((halves - last / 2) * self._pitch / 2)
-        x, y = np.meshgrid(*sides, indexing="ij")
-        return x.ravel(), y.ravel()
+        x, y = (p.ravel() for p in np.meshgrid(*sides, indexing="ij"))
+        known = np.isfinite(self.error(x, y)[0])
+        return x[known], y[known]
 
     def _weights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the weights of the sites in the interpolated error at points, (P, sites)."""

@@ -347,6 +347,27 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
     error, u = stage.length_error(([0.01, 0.01], [0.0, 0.0]), far)
     assert np.isfinite(error[0]) and u[0] > 0
     assert np.isnan(error[1]) and np.isnan(u[1])
+    assert stage.length_uncertainty()[0] > stage.length_uncertainty(anywhere=False)[0]
+
+
+def test_of_a_map_with_nodes_of_its_own_the_line_meets_the_largest_distance():
+    nodes, artifact = 5, plate(11, 5)
+    found, _ = readings(artifact, SIX, np.random.default_rng(3))
+    result = calibrate(found, Options(assumed=()))
+    stage = StageMap(result)
+    assert stage.method == "bicubic" and result.reads_between_nodes
+    a, b = stage.length_uncertainty()
+    half_m = (nodes - 1) / 2 * artifact.map_grid.pitch_m
+    halves_m = np.array(np.meshgrid(*[np.linspace(-half_m, half_m, 2 * nodes - 1)] * 2))
+    i, j = np.triu_indices((2 * nodes - 1) ** 2, 1)
+    pairs = halves_m.reshape(2, -1)[:, [i, j]].swapaxes(0, 1).reshape(4, -1)
+    ends = np.hstack(
+        [pairs, np.random.default_rng(4).uniform(-half_m, half_m, (4, 1000))]
+    )
+    _, u = stage.length_error(ends[:2], ends[2:])
+    U = result.noise.k_xy * u
+    margin = a + b * np.hypot(*(ends[:2] - ends[2:])) - U
+    assert -0.02 * np.nanmax(U) < np.nanmin(margin) < 0.1 * np.nanmax(U)
 
 
 def stage_of(plate, covariance, monkeypatch, halfway=((0, 0), (0, 0))):
@@ -384,10 +405,8 @@ def test_a_distance_anywhere_has_the_interpolation_of_its_own_direction(monkeypa
             plate, np.diag(np.repeat([1e-18, 9e-18], 9)), monkeypatch, halfway
         )
         a, b = stage.length_uncertainty()
-        worst = (
-            max(np.sqrt(2 * (1 + 64 * (row == 0))), np.sqrt(2 * (9 + 64 * (row == 1))))
-            * 1e-9
-        )
+        # from halfway to halfway, which along x share the middle one of the three nodes
+        worst = np.sqrt((1 / 2 if row == 0 else 9) + 2 * 64) * 1e-9
         assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * worst, rel=1e-6)
 
 
@@ -398,9 +417,9 @@ def test_a_distance_anywhere_may_end_in_the_cell_at_an_edge(monkeypatch):
     inside = stage.length_uncertainty()
     stage.edges[1, 0, 1] = 8e-9  # of Gy along x
     a, b = stage.length_uncertainty()
-    assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * np.sqrt(130) * 1e-9)
+    assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * np.sqrt(129) * 1e-9)
     assert a + b * 0.01 > 5 * (inside[0] + inside[1] * 0.01)
-    assert stage.length_uncertainty(anywhere=False) == inside
+    assert stage.length_uncertainty(anywhere=False) == pytest.approx(inside)
 
 
 def test_cells_of_an_oblong_field_share_no_error_of_interpolation(monkeypatch):
