@@ -3,6 +3,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,9 +20,10 @@ from rclpy.event_handler import (
 )
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from selfcal_ros.errors import InputError, printable
-from selfcal_ros.nodes.callbacks import WithInfo
+from selfcal_ros.nodes.callbacks import Numbered, WithInfo
 from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import (
     HEALTH,
@@ -45,6 +47,12 @@ from selfcal_ros.nodes.sessions.health import (
 from selfcal_ros.settings.parameter import BARE_Y, Parameter, Settings
 
 BEAT_S = 1.0  # between two health messages
+NUMBERS_TELL = "fastrtps" in get_rmw_implementation_identifier()
+"""Whether lost messages are known from the numbers of those that arrive.
+
+Fast DDS gives numbers, and its events of lost messages must not be taken: while more are lost, that
+locks the node for ever, deaf to signals (rmw_fastrtps 890). Cyclone DDS gives events alone.
+"""
 
 
 class NodeBase[S: Settings](Answering):
@@ -139,29 +147,31 @@ class NodeBase[S: Settings](Answering):
         )
         self._subscribed[name] = topic
 
-        def lost(event: Any) -> None:
-            # otherwise only the newest is used: the others are not lost
-            if topic.qos.depth > 1:
-                self.losses.add(topic.name, event.total_count_change)
+        lost = partial(self.losses.add, topic.name)
 
-        # no default callbacks: one due when a subscription ends would end the process (rclpy 1644).
-        # none of lost messages where numbers tell of them: taken while more are lost, it locks the
-        # node for ever, deaf to signals (rmw_fastrtps 890)
-        numbered = getattr(callback, "counts_losses", False)
+        def told(event: Any) -> None:
+            lost(event.total_count_change)
+
+        # otherwise only the newest is used: the others are not lost
+        is_counted = topic.qos.depth > 1
+        take = guarded
+        if (
+            is_counted
+            and NUMBERS_TELL
+            and not getattr(callback, "counts_losses", False)
+        ):
+            take = Numbered(guarded, lost)
+        # no default callbacks: one due when a subscription ends would end the process (rclpy 1644)
         events = SubscriptionEventCallbacks(
-            message_lost=None if numbered else lost, use_default_callbacks=False
+            message_lost=told if is_counted and not NUMBERS_TELL else None,
+            use_default_callbacks=False,
         )
-        return self.own(
-            self.create_subscription(
-                topic.type,
-                topic.name,
-                guarded,
-                topic.qos,
-                event_callbacks=events,
-                **kwargs,
-            ),
-            self.destroy_subscription,
+        subscription = self.create_subscription(
+            topic.type, topic.name, take, topic.qos, event_callbacks=events, **kwargs
         )
+        if isinstance(take, Numbered):
+            take.subscription = subscription
+        return self.own(subscription, self.destroy_subscription)
 
     def subscribe_with_age(
         self, topic: Topic, callback: Callable[[Any, bool], None], **kwargs: Any

@@ -39,6 +39,45 @@ class WithInfo:
         self._call(*received)
 
 
+class Numbered(WithInfo):
+    """A callback that counts what the numbers of its publisher say is missing.
+
+    The numbers of several publishers interleave: those of an only one are compared.
+
+    Parameters
+    ----------
+    call : callable
+        Takes the message, and its info if it is a `WithInfo`.
+    lost : callable
+        Takes the number of messages that are missing before this one.
+    """
+
+    def __init__(self, call: Callable[..., None], lost: Callable[[int], None]) -> None:
+        super().__init__(call)
+        self._lost = lost
+        self._last: int | None = None
+        self.subscription: Subscription | None = None
+
+    def __call__(self, *received: Any) -> None:
+        """Take a message and its info."""
+        # the events executor of rclpy 7.1 passes both as one pair
+        message, info = received[0] if len(received) == 1 else received
+        number = info["publication_sequence_number"]
+        is_only_one = (
+            self.subscription is not None
+            and self.subscription.get_publisher_count() == 1
+        )
+        if is_only_one and self._last is not None and number > self._last + 1:
+            self._lost(number - self._last - 1)
+        # smaller: of another one, which may be gone
+        is_next = self._last is None or number > self._last
+        self._last = number if is_only_one and is_next else None
+        if isinstance(self._call, WithInfo):
+            self._call(message, info)
+        else:
+            self._call(message)
+
+
 class Guarded(Node):
     """A node that no callback ends: exceptions are counted in `refusals` and logged.
 

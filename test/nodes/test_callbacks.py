@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """No callback ends a node: rclpy's own answer with a failure, and spin goes on."""
 
+from types import SimpleNamespace
+
 import pytest
 import rclpy
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -11,7 +13,10 @@ from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from selfcal_msgs.action import RunCalibration
 
-from selfcal_ros.nodes import running
+from selfcal_ros.nodes import names, running
+from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.callbacks import Numbered
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.names import Topic, _qos
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
@@ -129,3 +134,59 @@ def test_spin_goes_on_after_an_error(ros_environment):
         node.destroy_node()
     finally:
         rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ("numbers_and_publishers", "lost"),
+    [
+        pytest.param([(7, 1), (8, 1), (13, 1), (15, 1)], [4, 1], id="only one"),
+        pytest.param([(7, 1), (1, 1), (2, 1), (5, 1)], [2], id="started anew"),
+        pytest.param([(7, 1), (1, 2), (9, 2), (12, 1)], [], id="two at once"),
+        pytest.param([(7, 1), (1, 1), (8, 1), (9, 1)], [], id="one that came and went"),
+        pytest.param([(None, 1), (None, 1)], [], id="middleware without numbers"),
+    ],
+)
+def test_the_numbers_of_an_only_publisher_tell_what_is_missing(
+    numbers_and_publishers, lost
+):
+    taken, found = [], []
+    callback = Numbered(taken.append, found.append)
+    for number, publishers in numbers_and_publishers:
+        callback.subscription = SimpleNamespace(
+            get_publisher_count=lambda publishers=publishers: publishers
+        )
+        callback("message", {"publication_sequence_number": number})
+    assert found == lost
+    assert taken == ["message"] * len(numbers_and_publishers)
+
+
+def test_what_a_recorder_did_not_receive_is_in_its_health(graph, tmp_path):
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
+    detections = graph.publisher(names.DETECTIONS)
+    published = names.DETECTIONS.qos.depth + 1 + 700
+    detections.publish(names.DETECTIONS.type())
+
+    def kept():
+        return recorder._writer.counts["/stage/mark_detections"]
+
+    graph.until(lambda: kept() == 1, "the first")
+    for _ in range(published - 1):  # nobody spins meanwhile
+        detections.publish(names.DETECTIONS.type())
+    lost = recorder.losses.counts
+    graph.until(lambda: kept() + lost[names.DETECTIONS.name] == published, "the others")
+    recorder.close()
+    assert lost[names.DETECTIONS.name] > 0
+
+
+def test_no_event_of_lost_messages_is_taken(graph, tmp_path):
+    """Taken while more are lost, it may lock the node for ever (rmw_fastrtps 890)."""
+    plan = plan_file(tmp_path, small_plan())
+    for kind, parameters in (
+        (MeasurementCollector, {}),
+        (PoseSequencer, {"plan": plan}),
+        (Solver, {}),
+        (BagRecorder, {"bag": str(tmp_path / "bag")}),
+    ):
+        node = graph.node(kind, **parameters)
+        assert not any(item.event_handlers for item in node.subscriptions)
+    node.close()
