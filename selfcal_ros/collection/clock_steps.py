@@ -259,8 +259,14 @@ def _line(topics: str, step: ClockStep, timeline: Timeline) -> str:
         "between views" if view is None else f"in view '{timeline.views[view].name}'"
     )
     way, wrong = ("back", "an earlier") if step.by_ns < 0 else ("ahead", "a later")
+    # what was late from the begin on looks alike
+    or_late = (
+        " (unless messages were that late until then, and nothing is wrong)"
+        if step.by_ns > 0
+        else ""
+    )
     return (
         f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * S_PER_NS:.3g} s "
         f"{where}, at {step.before_ns * S_PER_NS:.3f} s: what was stamped since may be missing "
-        f"or counted in {wrong} view; {REMEDY}, and measure again from that view on"
+        f"or counted in {wrong} view{or_late}; {REMEDY}, and measure again from that view on"
     )
