@@ -84,7 +84,6 @@ def test_a_cell_is_brought_up_on_a_terminal_and_ends_by_its_key(tmp_path):
     [
         ("solve", "bags/hu_noise", "--budget"),
         ("plan", "check", "config/plans/hu.yaml"),
-        ("solve", "bags/hu_noise", "--sense", "plate_moves"),
         ("iso230", "R.json", "--radius", "20mm"),
     ],
     ids=" ".join,

@@ -91,8 +91,8 @@ def test_a_short_plate_is_stepped_over_a_long_stage(capsys):
 @pytest.mark.parametrize(
     ("travel", "minutes", "line"),
     [
-        ("1m", "60", "placed more than 1000 times: take a longer plate"),
-        ("59mm", "60", None),
+        ("1m", "20", "placed more than 1000 times: take a longer plate"),
+        ("59mm", "20", None),
     ],
     ids=["too short a plate", "hardly longer"],
 )

@@ -22,6 +22,7 @@ ONLY_PARSED = {
     "call": "needs a cell",
     "replay": "run by test/nodes/test_image_player.py",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
+    "plan new -o wide.yaml": "searches for long; shorter in test/cli/test_plan_new.py",
     "cell try": "asks a person; test/cli/test_cell_try.py",
     "measure examples/microscope": "needs pymmcore; run by test/machine/test_micromanager.py",
     "cell check": "needs a cell; test/nodes/test_cell_check.py",

@@ -83,7 +83,7 @@ def test_a_reversal_that_differs_over_the_field_is_named_and_in_u(
 ):
     """Without it 58 to 91 % of coordinates were in U, and the map was accepted."""
     shares = []
-    for seed in range(4):
+    for seed in range(2):
         truth, readings = measured(seed, reversal_m, order=order)
         result = worded(calibrate(readings, Options()))
         (cause,) = (c for c in result.verdict.causes if c.name == "reversal")
@@ -97,7 +97,7 @@ def test_a_reversal_that_differs_over_the_field_is_named_and_in_u(
 def test_distances_have_it_in_u_whatever_their_length():
     """As a field with alternating signs it was in one of 10 nm or of 200, at every other pitch."""
     beyond = []
-    for seed in range(4):
+    for seed in range(2):
         truth, readings = measured(seed, rising)
         result = calibrate(readings, Options())
         everywhere = np.ones((7, 7), dtype=bool)
@@ -122,7 +122,7 @@ def test_distances_have_it_in_u_whatever_their_length():
 
 
 def test_a_constant_reversal_differs_nowhere():
-    for seed in range(4):
+    for seed in range(2):
         _, readings = measured(seed, constant)
         assert reversal_of(fit_joint(readings, Options())) is None
         causes = calibrate(readings, Options()).verdict.causes
@@ -152,13 +152,13 @@ def test_the_datum_takes_the_mean_of_its_effect_off_every_node():
 
 
 def test_it_is_found_by_chance_as_often_as_its_level_says(monkeypatch):
-    """5 of 100 at 5 %; more than 12 in one of a thousand such tests."""
+    """3 of 60 at 5 %; more than 9 in one of a thousand such tests."""
     monkeypatch.setattr(reversal, "CAUSE_LEVEL", 0.05)
     found = 0
-    for seed in range(100):
+    for seed in range(60):
         _, readings = measured(seed, constant, size=5, views="0,90,tx,-tx")
         found += reversal_of(fit_joint(readings, Options())) is not None
-    assert 1 <= found <= 12
+    assert 1 <= found <= 9
 
 
 @pytest.mark.parametrize("sense", list(Sense))
