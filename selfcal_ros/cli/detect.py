@@ -10,6 +10,7 @@ from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.terminal import (
     add_json,
     add_parameters,
@@ -18,6 +19,7 @@ from selfcal_ros.cli.terminal import (
     say,
     warn,
 )
+from selfcal_ros.collection.inputs import Command
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import creating, write_bytes
@@ -89,8 +91,10 @@ def run(args: argparse.Namespace) -> int:
     draw = partial(_drawn, _empty(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or TYPED, draw)
     if args.positions:
-        problems = _from_files(args, detector, settings.frame_id)
+        problems = _from_files(args, detector, settings)
     else:
+        if settings.aruco:
+            _require_plates(args, settings)
         problems = ImageBag(Path(args.bag), args.namespace).write_detected(
             args.output,
             detector.take,
@@ -112,12 +116,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _from_files(
-    args: argparse.Namespace, detector: "ImageDetector", frame: str
+    args: argparse.Namespace, detector: "ImageDetector", settings: DetectorSettings
 ) -> "Counter[str]":
     """Write a bag from image files and a table of positions; return problems."""
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
     plan = read_plan(args.plan)
+    settings.require_plate(plan.artifact, args.params or TYPED)
     return write_pictures(
         Path(args.bag),
         read_positions(args.positions, plan),
@@ -125,8 +130,17 @@ def _from_files(
         args.output,
         detect=detector.take_file,
         check=partial(detector.refuse_nothing, args.bag),
-        frame_id=frame,
+        frame_id=settings.frame_id,
     )
+
+
+def _require_plates(args: argparse.Namespace, settings: DetectorSettings) -> None:
+    """Refuse markers of another plate than that of a command in the bag."""
+    space = args.namespace
+    bag = BagReader(Path(args.bag), None if space is None else space.strip("/"))
+    for _, item in bag.columns():
+        if isinstance(item, Command) and item.artifact is not None:
+            settings.require_plate(item.artifact, args.params or TYPED)
 
 
 def _empty(name: str) -> Path:
@@ -172,6 +186,10 @@ def text_of(output: str, counts: dict[str, int]) -> str:
         f"{counts[name]} {text}"
         for name, text in (
             ("images_without_marks", "images without marks"),
+            (
+                "images_with_contradicting_markers",
+                "images without ids: their markers do not lie as on this plate",
+            ),
             ("images_refused", "images refused"),
             (
                 "images_repeated",
@@ -184,9 +202,12 @@ def text_of(output: str, counts: dict[str, int]) -> str:
         )
         if counts.get(name)
     ]
+    named = counts.get("marks_with_ids")
+    ids = "" if named is None else f", {named} with their ids"
     return "; ".join(
         [
-            f"{output}: {counted(counts['marks'], 'mark')} in {counted(counts['images'], 'image')}",
+            f"{output}: {counted(counts['marks'], 'mark')} in "
+            f"{counted(counts['images'], 'image')}{ids}",
             *([f"rejected: {rejected}"] if rejected else []),
             *extra_counts,
         ]

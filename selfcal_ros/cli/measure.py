@@ -82,15 +82,18 @@ def run(args: argparse.Namespace) -> int:
             "--yes, but a person places the plate",
             "write placing: robot, or leave out --yes",
         )
+    work = None
     try:
         with ended_by_signals(), connected(cell, desk.say) as machine:
             work = Run(plan, cell, machine, bag, desk)
             work.require()
             work.measure(resume=args.resume)
-    except (MachineError, NoDataError) as error:
+    except InputError as error:
         desk.end()
         kind = NoDataError if isinstance(error, NoDataError) else InputError
-        remedies = filter(None, [error.remedy, resume_hint if bag.exists() else ""])
+        of_cell = isinstance(error, MachineError | NoDataError)
+        is_kept = bag.exists() if of_cell else work is not None and work.begun
+        remedies = filter(None, [error.remedy, resume_hint if is_kept else ""])
         raise kind(error.where, error.what, "; ".join(remedies)) from error
     except (KeyboardInterrupt, SystemExit) as ended:
         desk.end()

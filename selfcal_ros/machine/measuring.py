@@ -113,6 +113,8 @@ class Run:
         self._told_ns = 0
         self._journal: Journal | None = None
         self._resumed = False
+        self.begun = False
+        """Whether the bag is that of this run."""
 
     def require(self) -> None:
         """Refuse a plan that the machine cannot carry out, before anything moves.
@@ -121,7 +123,10 @@ class Run:
         ------
         MachineError
             If a stop is beyond the limits, or the machine lacks an axis or cannot place.
+        InputError
+            If the markers of the cell's detector are those of another plate.
         """
+        self.visitor.eye.require(self.plan.artifact)
         for view in self.plan.views:
             route = stops(
                 self.plan.artifact,
@@ -160,6 +165,7 @@ class Run:
             If marks are not seen; likewise.
         """
         commands = self._begin(resume)
+        self.begun = True
         try:
             with self.visitor.stopping():
                 self._write_all(commands)

@@ -8,6 +8,7 @@ import numpy as np
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.interface import Image, MachineError, Offset
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.vision.images import Picture
 
@@ -53,6 +54,11 @@ class Eye:
             )
             + ")"
         )
+
+    def require(self, artifact: Artifact) -> None:
+        """Refuse markers of another plate than this one; raises InputError."""
+        if self._settings is not None:
+            self._settings.require_plate(artifact, f"{self._where}: detector")
 
     def detections(
         self,

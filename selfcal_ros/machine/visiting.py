@@ -298,6 +298,7 @@ class Visitor:
         MachineError
             If anything is not as commanded.
         """
+        self.eye.require(artifact)
         route = stops(artifact, view, self.cell.sense)
         self.require(route)
         self._last, self._untold = None, []  # a person may have moved it by hand

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameters of mark_detector, which are the options of ``selfcal detect`` as well."""
 
+import re
 from dataclasses import dataclass
 from typing import ClassVar
 
-from selfcal_ros.settings.parameter import ManagedSettings, declared
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.settings.parameter import ManagedSettings, declared, place_of
 
 MARKS = ("disc", "ring", "cross", "corner")
 OPTIONS = {
@@ -118,3 +121,46 @@ class DetectorSettings(ManagedSettings):
     max_waiting: int = declared(
         32, "images that may wait; more are discarded and counted", "", 1, 1000
     )
+
+    def require_plate(self, artifact: Artifact, where: str) -> None:
+        """Refuse the markers of another plate, whose ids would be those of other marks.
+
+        Parameters
+        ----------
+        artifact : Artifact
+            Plate of the plan.
+        where : str
+            Place of the parameters, for errors.
+
+        Raises
+        ------
+        InputError
+            If `aruco` is set and this plate is not the one it describes.
+        """
+        if not self.aruco:
+            return
+        if artifact.marks is not None:
+            raise InputError(
+                place_of(where, "aruco"),
+                "the plate of the plan is a list of marks, and markers name those of a lattice",
+                "leave aruco out",
+            )
+        if coded_shape(self.aruco, where) != artifact.shape:
+            nx, ny = artifact.shape
+            raise InputError(
+                place_of(where, "aruco"),
+                f"'{self.aruco}', but the plate of the plan has {nx} x {ny} marks",
+                f"write {nx}x{ny}, or correct the plan",
+            )
+
+
+def coded_shape(text: str, where: str) -> tuple[int, int]:
+    """Return the marks along x and y of a plate with markers; InputError if they are not told."""
+    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if not match:
+        raise InputError(
+            place_of(where, "aruco"),
+            f"'{text}' is not the marks along x and y",
+            "write for example 11x9",
+        )
+    return int(match[1]), int(match[2])

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ids of marks from the ArUco markers at the edge of their plate, by OpenCV."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.edge_markers import CORNERS, DICTIONARY, SIDE, edge_markers
+from selfcal_ros.settings.detector import coded_shape
 from selfcal_ros.settings.parameter import place_of
 from selfcal_ros.vision.detector import Mark, MarkFault
 from selfcal_ros.vision.images import Picture
@@ -29,6 +29,11 @@ class CodedPlate:
     where : str
         Place of the text, for errors.
 
+    Attributes
+    ----------
+    contradicting : int
+        Images whose markers do not lie as on this plate, so that none is believed.
+
     Raises
     ------
     InputError
@@ -36,13 +41,7 @@ class CodedPlate:
     """
 
     def __init__(self, text: str, where: str) -> None:
-        match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
-        if not match:
-            raise InputError(
-                place_of(where, "aruco"),
-                f"'{text}' is not the marks along x and y",
-                "write for example 11x9",
-            )
+        shape = coded_shape(text, where)
         try:
             import cv2  # extra camera
         except ModuleNotFoundError as error:
@@ -51,8 +50,9 @@ class CodedPlate:
                 "OpenCV, which reads the markers, is not installed",
                 "pip install 'selfcal_ros[camera]', or leave aruco out",
             ) from error
-        self._shape = np.array([int(match[1]), int(match[2])])
-        self._centres = edge_markers(*self._shape.tolist())
+        self._shape = np.array(shape)
+        self._centres = edge_markers(*shape)
+        self.contradicting = 0
         parameters = cv2.aruco.DetectorParameters()
         parameters.detectInvertedMarker = True
         parameters.minMarkerPerimeterRate = 0.01
@@ -109,6 +109,7 @@ class CodedPlate:
         columns = np.stack([pixel, np.ones_like(pixel)], axis=1)
         factor, shift = np.linalg.lstsq(columns, place.ravel(), rcond=None)[0]
         if np.abs(factor * pixel + shift - place.ravel()).max() > AGREE:
+            self.contradicting += 1
             return None
         return lambda place_px: factor * place_px + shift, markers
 

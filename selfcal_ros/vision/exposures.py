@@ -52,6 +52,10 @@ class Counts:
         Images whose file has further pages, which were not used.
     marks : int
         Detections.
+    named : int or None
+        Those of them with the id of their mark; None where no markers are looked for.
+    contradicting : int
+        Images whose markers do not lie as on the plate, so that none is believed.
     rejected : Counter
         Reason -> rejected marks.
     """
@@ -62,6 +66,8 @@ class Counts:
     repeated: int = 0
     paged: int = 0
     marks: int = 0
+    named: int | None = None
+    contradicting: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -76,6 +82,12 @@ class Counts:
             "images_refused": self.refused,
             "images_without_marks": self.empty,
             "marks": self.marks,
+            **({} if self.named is None else {"marks_with_ids": self.named}),
+            **(
+                {"images_with_contradicting_markers": self.contradicting}
+                if self.contradicting
+                else {}
+            ),
             **({"images_repeated": self.repeated} if self.repeated else {}),
             **({"images_with_more_pages": self.paged} if self.paged else {}),
             **{
@@ -215,6 +227,10 @@ class ImageDetector:
         self.counts.images += 1
         self.counts.empty += not detections
         self.counts.marks += len(detections)
+        if self._coded is not None:
+            named = sum(item.has_id for item in detections)
+            self.counts.named = (self.counts.named or 0) + named
+            self.counts.contradicting = self._coded.contradicting
         self.counts.rejected.update(rejected)
         return detections
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from test.support.cells import CELL, PLAN, write_cell
+from test.support.cells import CELL, DETECTOR, PLAN, write_cell
 from test.support.power_cuts import Cut, detections, measured, outcome, prepare
 from test.support.terminals import SELFCAL
 
@@ -120,7 +120,6 @@ import signal
 import subprocess
 from pathlib import Path
 
-from selfcal_ros.machine.simulated import SimulatedMachine
 
 
 class LeftAlone(SimulatedMachine):
@@ -193,6 +192,21 @@ def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, cap
     assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 130
     [line] = capsys.readouterr().err.splitlines()
     assert line == "selfcal measure: stopped; nothing was measured yet"
+
+
+def test_any_error_of_a_run_says_that_its_bag_is_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_cell(tmp_path, camera=True)
+    cell = Path("cell.yaml")
+    cell.write_text(cell.read_text().replace(DETECTOR, ""))
+    words = ["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]
+    assert main(words) == 2
+    assert re.search(
+        "how marks are found in them is not stated; .*; bag is kept, --resume continues",
+        capsys.readouterr().err,
+    )
+    assert main(words) == 2
+    assert "is kept" not in capsys.readouterr().err  # it is that of another run
 
 
 def test_under_nohup_a_measurement_outlives_its_terminal(tmp_path, monkeypatch):

@@ -9,9 +9,12 @@ import pytest
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
+from selfcal_ros.cli.detect import text_of
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.edge_markers import edge_markers
+from selfcal_ros.model.marks import MarkList
 from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.exposures import ImageDetector
@@ -162,26 +165,70 @@ def identify(svg, seed):
     return len(wanted)
 
 
-def test_a_camera_knows_which_marks_it_sees(tmp_path):
-    """Ids and centres in ten images at any turn, shift and blur, mirrored or not."""
+@pytest.fixture
+def coded_svg(tmp_path):
+    """The artwork of a plate of 6 x 5 marks with markers."""
     pytest.importorskip("cv2")
     (tmp_path / "seen.yaml").write_text(SEEN)
     file = tmp_path / "seen.svg"
-    assert (
-        main(
-            [
-                "plate",
-                str(tmp_path / "seen.yaml"),
-                "-o",
-                str(file),
-                "--aruco",
-                "--mark-size",
-                "3e-4",
-            ]
-        )
-        == 0
+    words = ["--aruco", "--mark-size", "3e-4"]
+    assert main(["plate", str(tmp_path / "seen.yaml"), "-o", str(file), *words]) == 0
+    return file.read_text()
+
+
+def test_markers_that_do_not_lie_as_on_the_plate_name_no_mark_and_are_counted(
+    coded_svg,
+):
+    """In a corner, markers of two sides of another plate contradict each other."""
+    rng = np.random.default_rng(1)
+    picture, _ = photographed(
+        coded_svg, rng, turn=0.3, centre=(2.5, -2.0), mirror=False
     )
-    assert sum(identify(file.read_text(), seed) for seed in range(10)) > 30
+    sizes = {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4}
+    of_plate, of_other = (
+        ImageDetector(DetectorSettings.checked(sizes | {"aruco": shape}, "test"))
+        for shape in ("6x5", "5x6")
+    )
+    named = of_plate.take_picture(picture, 1)
+    assert named and all(each.has_id for each in named)
+    assert of_plate.counts.values()["marks_with_ids"] == len(named)
+    assert not any(each.has_id for each in of_other.take_picture(picture, 1))
+    counts = of_other.counts.values()
+    assert counts["marks_with_ids"] == 0
+    assert counts["images_with_contradicting_markers"] == 1
+    assert text_of("bag", counts).startswith(
+        f"bag: {counts['marks']} marks in 1 image, 0 with their ids"
+    )
+    assert "1 images without ids" in text_of("bag", counts)
+
+
+def test_a_camera_knows_which_marks_it_sees(coded_svg):
+    """Ids and centres in ten images at any turn, shift and blur, mirrored or not."""
+    assert sum(identify(coded_svg, seed) for seed in range(10)) > 30
+
+
+@pytest.mark.parametrize(
+    ("artifact", "said"),
+    [
+        (Artifact(6, 1e-3, grid_size_y=5), ""),
+        (
+            Artifact(5, 1e-3, grid_size_y=6),
+            "'6x5', but the plate of the plan has 5 x 6",
+        ),
+        (
+            Artifact(
+                5, 1e-3, marks=MarkList((7, 8, 9), (0.0, 1e-3, 0.0), (0.0, 0.0, 1e-3))
+            ),
+            "the plate of the plan is a list of marks",
+        ),
+    ],
+)
+def test_markers_are_those_of_the_plate_of_the_plan(artifact, said):
+    settings = DetectorSettings.checked({"aruco": "6x5"}, "test")
+    if not said:
+        return settings.require_plate(artifact, "test")
+    with pytest.raises(InputError, match=said):
+        settings.require_plate(artifact, "test")
 
 
 def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):

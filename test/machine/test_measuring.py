@@ -113,6 +113,15 @@ def test_a_view_of_lines_needs_a_rotary_axis(tmp_path):
         run_of(tmp_path, spoilt, cell).require()
 
 
+def test_markers_of_another_plate_are_refused_before_anything_moves(tmp_path):
+    cell, machine = write_cell(tmp_path, camera=True)
+    cell = replace(cell, detector=replace(cell.detector, aruco="3x4"))
+    with pytest.raises(
+        InputError, match=r"cell.yaml: detector: aruco: '3x4', but .* has 3 x 3 marks"
+    ):
+        run_of(tmp_path, machine, cell).require()
+
+
 def test_nothing_moves_while_the_plate_is_placed(tmp_path):
     cell, machine = write_cell(tmp_path, cell=CELL.replace("robot", "person"))
     spoilt = Spoilt(machine)
