@@ -14,8 +14,11 @@ from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
-GROUP, BESIDE = 5, 3
-"""Messages per group, and groups compared on either side of a step."""
+GROUP, BESIDE = 3, 5
+"""Messages per group, and groups compared on either side of a step. The marks of an image, which
+share a stamp and its delay, are in one."""
+MOST_ALIKE = 1000
+"""Messages of one stamp in a group, for a clock that stands still."""
 REMEMBERED = 10_000
 """Messages within which one that is sent again is known by its stamp."""
 SLEW = 2000
@@ -50,8 +53,9 @@ class StepWatch:
     A step changes the difference of stamps and reception at once and permanently: the values before
     and after do not overlap. Late, bundled or lost messages look different: when a delay ends, and
     delayed messages were lost, stamps get closer to their reception again, but no closer
-    than before. Messages that are sent again at once are no step either. If the clock of reception
-    steps as well, only a step back can be distinguished from a pause.
+    than before. Messages that are sent again at once are no step either, nor images of which some
+    take a detector longer. If the clock of reception steps as well, only a step back can be
+    distinguished from a pause. A step is seen 15 messages, or five images, later.
 
     Parameters
     ----------
@@ -61,9 +65,9 @@ class StepWatch:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_ns = round(limit_s * NS_PER_S)
-        self._first_ns: int | None = None
         self._remembered_ns = np.zeros(0, dtype=np.int64)
         self._rest = np.zeros((3, 0), dtype=np.int64)  # an incomplete group
+        self._n_grouped = 0  # messages before it
         self._groups = np.zeros((8, 0), dtype=np.int64)
         self._nearest: tuple[int, int] | None = None  # largest offset, and its time
         self._quiet = 0  # groups still affected by a reported step
@@ -76,24 +80,24 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
-        if self._first_ns is None and len(stamps_ns):
-            self._first_ns = int(stamps_ns[0])
         new = np.stack([stamps_ns, received_ns, self._sent_again(stamps_ns)])
         messages = np.concatenate([self._rest, new], axis=1)
-        n_grouped = messages.shape[1] // GROUP * GROUP
-        self._rest = messages[:, n_grouped:]
-        if not n_grouped:
+        starts = self._starts(messages[0])
+        if len(starts) < 2:
+            self._rest = messages
             return []
-        stamps, received, again = messages[:, :n_grouped].reshape(3, -1, GROUP)
-        offset = stamps - received
+        self._rest = messages[:, starts[-1] :]
+        self._n_grouped += int(starts[-1])
+        stamps, received, again = messages[:, : starts[-1]]
+        columns = (stamps - received, stamps, received, again)
         self._groups = np.concatenate(
             [
                 self._groups,
                 np.stack(
                     [
-                        column
-                        for values in (offset, stamps, received, again)
-                        for column in (values.min(axis=1), values.max(axis=1))
+                        ends.reduceat(column, starts[:-1])
+                        for column in columns
+                        for ends in (np.minimum, np.maximum)
                     ]
                 ),
             ],
@@ -102,6 +106,16 @@ class StepWatch:
         steps = self._look()
         self._groups = self._groups[:, -2 * BESIDE :]
         return steps
+
+    def _starts(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return where groups begin in the messages that are not grouped yet; the last is open."""
+        number = np.arange(len(stamps_ns))
+        begins = np.r_[True, np.diff(stamps_ns) != 0] if len(number) else number > 0
+        since = np.maximum.accumulate(np.where(begins, number, 0))
+        begins |= (number - since) % MOST_ALIKE == 0
+        first = number[begins]
+        group = (first + self._n_grouped) // GROUP
+        return first[np.r_[True, np.diff(group) != 0]] if len(first) else first
 
     def _sent_again(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return which messages bear a stamp from before the last change of stamps, (n,).
@@ -142,12 +156,8 @@ class StepWatch:
                 self._quiet -= 1
                 continue
             nearest, when = self._nearest_so_far(before[1][:, number])
-            # by at least half of it: the rest may be a delay that ended; a detector takes longer
-            # for its first image than for any other
-            is_first = before[1][1, number] == self._first_ns
-            ahead = not is_first and (
-                offset[number] - nearest > max(self._limit_ns, size[number]) // 2
-            )
+            # by at least half of it: the rest may be a delay that ended
+            ahead = offset[number] - nearest > max(self._limit_ns, size[number]) // 2
             if size[number] < 0 or (size[number] and ahead):
                 # of the groups affected, the middle one contains the step
                 last = min(number + BESIDE, count)

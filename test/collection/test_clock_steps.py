@@ -4,7 +4,12 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.clock_steps import ClockStep, StepWatch, step_lines
+from selfcal_ros.collection.clock_steps import (
+    MOST_ALIKE,
+    ClockStep,
+    StepWatch,
+    step_lines,
+)
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact
@@ -57,7 +62,7 @@ def test_the_limit(by_ns, number):
     assert len(found(stepped(1500, by_ns), TRUE)) == number
 
 
-@pytest.mark.parametrize("at", [5, 30, 55])
+@pytest.mark.parametrize("at", [5, 30, 54])
 @pytest.mark.parametrize(
     ("period_ns", "by_ns"),
     [
@@ -200,6 +205,35 @@ def cold():
     """Images of 25 marks every 2 s; the detector takes a second for the first one."""
     stamps = np.repeat(TRUE[0] + np.arange(60) * 2 * S, 25)
     return stamps, stamps + np.where(np.arange(len(stamps)) < 25, S, 20 * MS)
+
+
+@pytest.mark.parametrize("marks", [1, 9, 100])
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_images_that_take_a_detector_longer_or_shorter_show_no_step(workers, marks):
+    """One a second, each given to the worker that is free first: they come out of order."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        takes_s = 0.3 * np.exp(0.6 * rng.standard_normal(120))
+        exposed_s, free_s = np.arange(120.0), np.zeros(workers)
+        found_s = np.empty(120)
+        for image in range(120):
+            worker = free_s.argmin()
+            free_s[worker] = max(exposed_s[image], free_s[worker]) + takes_s[image]
+            found_s[image] = free_s[worker]
+        order = np.argsort(found_s)
+        stamps, received = (
+            TRUE[0] + (np.repeat(at_s[order], marks) * S).astype(int)
+            for at_s in (exposed_s, found_s)
+        )
+        assert found(stamps, received) == []
+
+
+def test_a_stamp_that_never_changes_shows_no_step_and_takes_no_memory():
+    watch = StepWatch(0.1)
+    for at in range(0, 20_000, 100):
+        same = np.full(100, TRUE[0])
+        assert watch.add(same, same + (at + np.arange(100)) * MS) == []
+    assert watch._rest.shape[1] <= MOST_ALIKE
 
 
 @pytest.mark.parametrize("phase", range(5))
