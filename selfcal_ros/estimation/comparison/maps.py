@@ -202,11 +202,7 @@ def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _of_largest(
-    largest: float,
-    n: int,
-    drawn: np.ndarray | None,
-    noise_dof: float,
-    level: float = USUAL_LEVEL / 2,
+    largest: float, n: int, drawn: np.ndarray | None, noise_dof: float, level: float
 ) -> tuple[float, float]:
     """Return the probability of such a |z| among n values, and the limit of a level.
 

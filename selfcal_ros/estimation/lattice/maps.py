@@ -65,7 +65,7 @@ class LatticeViews:
         """
         turned_back = self.phases.conj() * self.shifts
         apart = turned_back[:, None] - turned_back
-        return ceil(max(abs(apart.real).max(initial=0), abs(apart.imag).max(initial=0)))
+        return ceil(np.maximum(apart.real, apart.imag).max(initial=0))  # of either sign
 
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
         """Return the m and n of a mark by its index."""

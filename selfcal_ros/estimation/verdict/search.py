@@ -184,7 +184,7 @@ class Search:
             more = np.sqrt(ratio**2 - 1)
             on_plate = None
             if plate.u_ax.size:
-                on_plate = more * np.nan_to_num(np.stack([plate.u_ax, plate.u_ay]))
+                on_plate = more * np.stack([plate.u_ax, plate.u_ay])
             self.effects.append(
                 Effect(
                     NOISE,

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, f
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
@@ -344,7 +344,7 @@ def test_what_rechecks_share_does_not_average_out():
 
 
 def test_noise_that_the_detections_of_rechecks_declare_averages_out():
-    """It is of type B, as is what they share."""
+    """It is of type B, as is what they share; without a budget all of it may be what they share."""
     noise = BudgetLine(
         quantity="xy",
         component="reading noise",
@@ -357,11 +357,17 @@ def test_noise_that_the_detections_of_rechecks_declare_averages_out():
         SimpleNamespace(calibration=SimpleNamespace(readings={"sha256": plate}))
         for plate in ("first", "second")
     ]
-    runs = [
-        part(name, replace(result, budget=(noise,), recheck=plate))
-        for name, result, plate in zip("ab", (A, B), plates, strict=True)
-    ]
-    assert not combine(runs).xy.common.any()
+    averaged, shared = (
+        combine(
+            [
+                part(name, replace(result, budget=budget, recheck=plate))
+                for name, result, plate in zip("ab", (A, B), plates, strict=True)
+            ]
+        ).xy
+        for budget in ((noise,), ())
+    )
+    assert not averaged.common.any()
+    np.testing.assert_allclose(shared.common, 2 * averaged.within, rtol=0.02)
 
 
 def test_a_scale_of_the_lines_that_is_assumed_does_not_average_out():
@@ -768,6 +774,30 @@ def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
         rest.values, np.sqrt(2) * values @ others @ others.T, atol=1e-12
     )
     np.testing.assert_allclose(rest.share, (others**2).sum(axis=1))
+
+
+@pytest.mark.parametrize("size", [0.5, 3.0])
+def test_a_run_stands_out_by_the_F_test_of_its_distance(size):
+    """Four runs of equal variance, with a part between them and without, and 30 nodes each."""
+    nodes = 30
+    values = size * np.random.default_rng(3).normal(size=(4, nodes))
+    runs = [run_of(one, 1.0) for one in values]
+    found = mean_of(runs, np.zeros((nodes, 0)), np.zeros((nodes, 0)))
+    assert bool(found.between.any()) == (size > 1)
+    for run, (one, deviation) in enumerate(zip(values, found.deviations, strict=True)):
+        others = np.delete(values, run, axis=0)
+        of_run = ((one - others.mean(axis=0)) ** 2).sum() / (1 + 1 / 3)
+        ratio = of_run / others.var(axis=0, ddof=1).sum()
+        expected = f.sf(ratio, nodes, 2 * nodes)
+        assert deviation.p_scatter == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_mean_of_runs_of_few_degrees_of_freedom_has_those_of_both():
+    """Variances of 5 degrees of freedom each: their sum has 10 (Welch-Satterthwaite)."""
+    nodes = 10_000
+    run = RunValues(np.zeros(nodes), np.ones(nodes), np.zeros(nodes), True, 5.0)
+    found = mean_of([run, run], np.zeros((nodes, 0)), np.zeros((nodes, 0)))
+    assert found.dof == pytest.approx(10, rel=0.01)
 
 
 @pytest.mark.parametrize(

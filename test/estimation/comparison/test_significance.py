@@ -153,9 +153,11 @@ def test_nodes_that_move_together_are_as_one(noise_dof):
     alone = student_t(noise_dof) if np.isfinite(noise_dof) else norm
     limit = alone.isf(USUAL_LEVEL / 4)
     drawn = ReducedNoise(np.ones((10, 10)), np.zeros((10, 0)), noise_dof).drawn
-    p, found = _of_largest(limit, 10, abs(drawn).max(axis=0), noise_dof)
+    p, found = _of_largest(
+        limit, 10, abs(drawn).max(axis=0), noise_dof, USUAL_LEVEL / 2
+    )
     assert p == pytest.approx(USUAL_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
     assert found == pytest.approx(limit, rel=0.06)
-    apart, bound = _of_largest(limit, 10, None, noise_dof)
+    apart, bound = _of_largest(limit, 10, None, noise_dof, USUAL_LEVEL / 2)
     assert apart == pytest.approx(10 * USUAL_LEVEL / 2)
     assert bound == pytest.approx(alone.isf(USUAL_LEVEL / 40))

@@ -43,13 +43,17 @@ def errors_over_u(result, truth):
     return (np.array(found) - true) / first_order_u(result)
 
 
-def test_slow_motion_is_in_the_uncertainty(monkeypatch):
-    inside, unaware, covers = [], [], []
+def test_slow_motion_is_found_with_its_size_and_is_in_the_uncertainty(monkeypatch):
+    inside, unaware, covers, found = [], [], [], []
     for seed in range(4):
         truth, readings = measured(seed, flicker_xy_m=IMAGE_M)
         result = solve_joint(readings, ALONE).result
         inside.append(errors_over_u(result, truth))
         covers.append(covered(result, truth.g))
+        motion = result.kept.images.motion
+        found.append(
+            [result.noise.sigma_xy**2 * v for v in (motion.slow, motion.white)]
+        )
         with monkeypatch.context() as patch:
             patch.setattr(noise_effects, "slow_motion", lambda model: None)
             result = solve_joint(readings, ALONE).result
@@ -57,6 +61,8 @@ def test_slow_motion_is_in_the_uncertainty(monkeypatch):
     assert np.sqrt(np.mean(np.square(inside))) < 1.3
     assert np.sqrt(np.mean(np.square(unaware))) > 1.5
     assert np.mean(covers) > 0.93
+    slow, white = np.mean(found, axis=0) / IMAGE_M**2
+    assert slow == pytest.approx(1, rel=0.15) and white < 0.25
 
 
 def test_white_motion_of_images_is_not_slow():

@@ -104,6 +104,8 @@ def test_a_line_that_is_off_in_one_view_is_named():
     assert bad.verdict.grade is Grade.ENLARGED
     (item,) = bad.verdict.enlarged_by
     assert (item.name, item.unit) == ("reading", "rad")
+    # one of 24 lines is off by so much, and nobody knows which
+    assert item.u_rms == pytest.approx(1e-3 / np.sqrt(24), rel=0.2)
     off = bad.error_map.g_theta - truth.g_theta
     assert (
         np.mean(abs(off - off.mean()) <= bad.noise.k_theta * bad.error_map.u_g_theta)
