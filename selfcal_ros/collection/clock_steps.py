@@ -148,7 +148,8 @@ class StepWatch:
         ).max(0)
         before = (low[:, :count], high[:, :count])
         after = (low[:, BESIDE + 1 :][:, :count], high[:, BESIDE + 1 :][:, :count])
-        size = _parted(before, after, self._limit_ns)
+        between = self._groups[2:4, BESIDE : BESIDE + count]
+        size = _parted(before, between, after, self._limit_ns)
         offset = (after[0][0] + after[1][0]) // 2
         out = []
         for number in range(count):
@@ -186,11 +187,14 @@ class StepWatch:
         return self._nearest
 
 
-def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
+def _parted(
+    before: Span, between: np.ndarray, after: Span, limit_ns: int
+) -> np.ndarray:
     """Return the step of the clock between two spans of messages; 0 if none.
 
-    The centres of the spans are compared, and the step must exceed the scatter of both. A
-    reception that stands still, as where a converter writes none, tells nothing.
+    `between` are the lowest and highest stamp of the group with the step. The centres of the spans
+    are compared, and the step must exceed the scatter of both. A reception that stands still, as
+    where a converter writes none, tells nothing.
     """
     (low, high), (next_low, next_high) = before, after
     scatter = np.maximum(high[0] - low[0], next_high[0] - next_low[0])
@@ -204,7 +208,10 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
         for lowest, highest in (before, after)
     )
     sent_again = next_outrun & ~outrun & (next_high[3] > 0)
-    back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2) & ~sent_again
+    goes_back = np.maximum(
+        np.maximum(high[1], between[1]) - next_low[1], high[1] - between[0]
+    )
+    back = clear & (by < 0) & (goes_back > limit_ns // 2) & ~sent_again
     # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
     together = (

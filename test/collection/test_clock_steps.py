@@ -69,6 +69,7 @@ def test_the_limit(by_ns, number):
         (S // 10, -5 * S),
         (S // 10, -S // 2),
         (S // 10, S // 2),
+        (S, -2 * S),
         (2 * S, -5 * S),
         (2 * S, S // 2),
         (2 * S, 5 * S),
