@@ -141,7 +141,7 @@ def unheard(node: Node, subscribed: Mapping[str, Topic]) -> Diagnosis:
         for other in node.get_publishers_info_by_topic(name)
         if (why := _mismatch(topic, other, publishes=True))
     ]
-    return Diagnosis(Level.ERROR if faults else Level.OK, "; ".join(faults))
+    return Diagnosis.of(faults, level=Level.ERROR)
 
 
 def unreached(node: Node, published: Mapping[str, Topic]) -> Diagnosis:
@@ -152,7 +152,7 @@ def unreached(node: Node, published: Mapping[str, Topic]) -> Diagnosis:
         for other in node.get_subscriptions_info_by_topic(name)
         if (why := _mismatch(topic, other, publishes=False))
     ]
-    return Diagnosis(Level.WARN if faults else Level.OK, "; ".join(faults))
+    return Diagnosis.of(faults)
 
 
 def _mismatch(topic: Topic, other: Any, *, publishes: bool) -> str:
@@ -186,9 +186,7 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
                 f"{topic} has {len(offers)} publishers: "
                 f"{', '.join(sorted(map(node_of, offers)))}; only one is allowed"
             )
-    return Diagnosis(
-        Level.WARN if shared_topics else Level.OK, "; ".join(shared_topics)
-    )
+    return Diagnosis.of(shared_topics)
 
 
 def rivals(node: Node, topics: Iterable[str]) -> str:

@@ -438,30 +438,39 @@ class CollectingSession:
         detections_matched : bool
             Whether a publisher of detections has been found.
         """
-        received = {
-            f"{kind}_received": n for kind, n in self.collector.received.items()
-        }
-        missed = ", ".join(self.missed.values())
-        state = self._problem or self._state
-        state += f"; began before this node: {missed}" if missed else ""
-        stored = self.collector.storage_problem
-        state += f"; {stored}" if stored else ""
-        last = self.collector.newest_command
-        gap = (
-            self._gap
-            if last is not None and last.stamp_ns == self._gap_stamp_ns
-            else ""
+        return merged(
+            self._received(detections_matched=detections_matched),
+            [
+                Diagnosis.of(self._run_lines.values()),
+                self._checks.diagnosis(),
+                Diagnosis.of(self._rejections.findings or advice(self._rejected)),
+                self._clock.diagnosis(),
+                Diagnosis.of(self._stepped),
+                self._encoder(),
+                self._repeatability(),
+            ],
         )
-        state += f"; {gap}" if gap else ""
-        unusable = self.collector.unusable
-        if unusable:
-            state += f"; messages not used: {counted_reasons(unusable.items())}"
-        bad = missed or self._problem or unusable or stored or gap
-        main = Diagnosis(
-            Level.WARN if bad else Level.OK,
-            state,
+
+    def _received(self, *, detections_matched: bool) -> Diagnosis:
+        """Return what has been received, WARN if some of it is missing or unusable."""
+        missed = ", ".join(self.missed.values())
+        last = self.collector.newest_command
+        gap_lasts = last is not None and last.stamp_ns == self._gap_stamp_ns
+        unusable = counted_reasons(self.collector.unusable.items())
+        missing = [
+            f"began before this node: {missed}" if missed else "",
+            self.collector.storage_problem,
+            self._gap if gap_lasts else "",
+            f"messages not used: {unusable}" if unusable else "",
+        ]
+        lines = [self._problem or self._state, *filter(None, missing)]
+        return Diagnosis(
+            Level.WARN if self._problem or any(missing) else Level.OK,
+            "; ".join(lines),
             {
-                **received,
+                **{
+                    f"{kind}_received": n for kind, n in self.collector.received.items()
+                },
                 "views": len(self._published),
                 **self._newest(),
                 **self._cost(),
@@ -471,27 +480,6 @@ class CollectingSession:
                     for reason, n in sorted(self._rejected.items())
                 },
             },
-        )
-        lines = self._rejections.findings or advice(self._rejected)
-        diagnosis = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
-        runs = Diagnosis(
-            Level.WARN if self._run_lines else Level.OK,
-            "; ".join(self._run_lines.values()),
-        )
-        stepped = Diagnosis(
-            Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped)
-        )
-        return merged(
-            main,
-            [
-                runs,
-                self._checks.diagnosis(),
-                diagnosis,
-                self._clock.diagnosis(),
-                stepped,
-                self._encoder(),
-                self._repeatability(),
-            ],
         )
 
     def _cost(self) -> dict[str, str]:
@@ -552,9 +540,7 @@ class CollectingSession:
                 f"the intervals between encoder samples vary by {jitter:.3g} s, the "
                 f"limit is {limit:g} s"
             )
-        return Diagnosis(
-            Level.WARN if problems else Level.OK, "; ".join(problems), values
-        )
+        return Diagnosis.of(problems, values)
 
     def _repeatability(self) -> Diagnosis:
         """Return the repeatability of the newest view, WARN beyond the limits."""
@@ -584,6 +570,4 @@ class CollectingSession:
                     f"{name.replace('_', ' ')} is {value * scale:.3g} {symbol}, the "
                     f"limit {limit * scale:.3g} {symbol}"
                 )
-        return Diagnosis(
-            Level.WARN if problems else Level.OK, "; ".join(problems), values
-        )
+        return Diagnosis.of(problems, values)

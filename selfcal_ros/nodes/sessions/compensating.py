@@ -539,7 +539,7 @@ class CompensatingSession:
                 "as at its edge: how well is not known"
             )
         if not seen.ages_s:
-            return Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
+            return Diagnosis.of(lines)
         oldest_s = max(seen.ages_s)
         limit_s = self._settings.max_age
         if oldest_s > limit_s:
@@ -547,9 +547,8 @@ class CompensatingSession:
                 f"a corrected position was {oldest_s * MS_PER_S:.1f} ms old when it was "
                 f"published, max_age is {limit_s * MS_PER_S:g} ms"
             )
-        return Diagnosis(
-            Level.WARN if lines else Level.OK,
-            "; ".join(lines),
+        return Diagnosis.of(
+            lines,
             {
                 "age_ms": f"{median(seen.ages_s) * MS_PER_S:.2f}",
                 "age_ms_max": f"{oldest_s * MS_PER_S:.2f}",

@@ -3,7 +3,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -35,6 +35,17 @@ class Diagnosis:
     level: Level
     message: str
     values: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        wrong: Collection[str],
+        values: dict[str, Any] | None = None,
+        *,
+        level: Level = Level.WARN,
+    ) -> "Diagnosis":
+        """Return lines on what is wrong, at `level`; OK if there are none."""
+        return cls(level if wrong else Level.OK, "; ".join(wrong), values or {})
 
     def number(self, key: str) -> int | None:
         """Return a value that is a non-negative int64; else None."""
@@ -126,9 +137,8 @@ class Tally:
         recent = [
             line for place, (_, line) in self._last.items() if self._is_recent(place)
         ]
-        return Diagnosis(
-            Level.WARN if recent else Level.OK,
-            "; ".join(recent),
+        return Diagnosis.of(
+            recent,
             {f"{self.word} {place}": n for place, n in sorted(self.counts.items())},
         )
 
@@ -348,7 +358,7 @@ class CellChecks:
     def diagnosis(self) -> Diagnosis:
         """Return the faults, ERROR if any."""
         wrong = [line for line in (*self._miswired.values(), self._misplaced) if line]
-        return Diagnosis(Level.ERROR if wrong else Level.OK, "; ".join(wrong))
+        return Diagnosis.of(wrong, level=Level.ERROR)
 
 
 class StallWatch:

@@ -378,9 +378,8 @@ class JournalKeeper:
             wrong.append(f"{self.lost} messages are not in the journal")
         if lag_s > self._lag_limit_s:
             wrong.append(f"the disk is {lag_s:.1f} s behind with the journal")
-        return Diagnosis(
-            Level.WARN if wrong else Level.OK,
-            "; ".join(wrong),
+        return Diagnosis.of(
+            wrong,
             {
                 "journal": str(self.path or ""),
                 "journal_lag_s": f"{lag_s:.2f}",
