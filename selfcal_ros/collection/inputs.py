@@ -83,6 +83,11 @@ class EncoderSample:
     positions: tuple[float, ...]
     velocities: tuple[float, ...] = ()
 
+    @property
+    def by_joint(self) -> dict[str, float]:
+        """Joint -> its position."""
+        return dict(zip(self.names, self.positions, strict=False))
+
 
 @dataclass(frozen=True)
 class EncoderBlock:

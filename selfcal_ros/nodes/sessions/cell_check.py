@@ -21,7 +21,7 @@ from selfcal_ros.collection.inputs import (
     Phase,
     Reason,
 )
-from selfcal_ros.errors import printable
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.checks.wiring import (
     sign_of_lines_is_shown,
     wiring_error,
@@ -34,6 +34,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes.sessions.cell_faults import (
     FOLLOWS,
     Fault,
+    Recorded,
     explaining,
     slope_of,
 )
@@ -197,7 +198,9 @@ class CellCheck:
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run_and_diagnosed()
         self.publishers: dict[str, list[str]] = {}  # topic -> nodes that publish on it
-        self._events: list[EncoderSample | Detection] = []  # of the measured view
+        # of the measured view
+        self._encoder: list[EncoderSample] = []
+        self._detections: list[Detection] = []
 
     def take_encoder(self, message: Any) -> None:
         """Take a sample of the encoder."""
@@ -205,11 +208,11 @@ class CellCheck:
         self._samples.append((sample.stamp_ns, self._ports.now_ns() - sample.stamp_ns))
         self._note_joints(sample)
         self._collector.add_encoder(sample)
-        self._events.append(sample)
+        self._encoder.append(sample)
 
     def _note_joints(self, sample: EncoderSample) -> None:
         """Keep the names of joints: all that are wanted, of others so many."""
-        where = dict(zip(sample.names, sample.positions, strict=False))
+        where = sample.by_joint
         for name in sample.names:
             if name in self._wanted_joints:
                 self._joints.add(name)
@@ -235,7 +238,7 @@ class CellCheck:
             )
         )
         self._collector.add_detection(detection)
-        self._events.append(detection)
+        self._detections.append(detection)
 
     def take_health(self, node: str, level: int, line: str) -> None:
         """Take the health of a node of the cell: its level, and what is wrong."""
@@ -361,7 +364,7 @@ class CellCheck:
         aborted = self._send(Phase.ABORT)
         self._pause_s = self._longest_pause_s()
         yield from self._wait(self._pause_s)
-        before = len(self._events)
+        before = len(self._detections)
         yield from self._wait(self._pause_s)
         late = self._exposed_since(aborted, before, self._pause_s / 2)
         self._tell(
@@ -374,7 +377,8 @@ class CellCheck:
 
     def _measured(self) -> Steps[Command]:
         """Measure the view until it is complete or detections stop; return its MEASURE."""
-        self._collector, self._seen, self._events = Collector(self._settings), [], []
+        self._collector = Collector(self._settings)
+        self._seen, self._encoder, self._detections = [], [], []
         command = yield from self._place_and_measure(self.view)
         self._n_early = len(self._seen)
         self._collector.add_command(command)
@@ -416,7 +420,7 @@ class CellCheck:
         """Send commands again that the cell has already executed."""
         count = 0
         for command in commands:
-            before = len(self._events)
+            before = len(self._detections)
             ended = self._command
             self._publish(command)
             yield from self._wait(self._pause_s)
@@ -435,12 +439,11 @@ class CellCheck:
     ) -> int:
         """Return the number of detections exposed after a command: others are in transit.
 
-        Of those received after the first `before` messages, and exposed `grace_s` after it.
+        Of those received after the first `before` ones, and exposed `grace_s` after it.
         """
         end_ns = command.stamp_ns + round(grace_s * NS_PER_S)
         return sum(
-            isinstance(event, Detection) and event.stamp_ns > end_ns
-            for event in self._events[before:]
+            detection.stamp_ns > end_ns for detection in self._detections[before:]
         )
 
     def _place_and_measure(self, view: View) -> Steps[Command]:
@@ -650,7 +653,8 @@ class CellCheck:
             for reason, count in rejected.items()
             if reason in REMEDY and reason != Reason.OUTLIER
         )
-        return explaining(self._command, self._events, self._settings) if bad else None
+        recorded = Recorded(self._command, self._encoder, self._detections)
+        return explaining(recorded, self._settings) if bad else None
 
     def _judge_ids(self, rejected: Mapping[str, int], fault: Fault | None) -> bool:
         """Tell, and return, whether detections are where their ids, or their marks, are."""
@@ -764,7 +768,6 @@ class CellCheck:
             Whether they do, and whether they show how they do not.
         """
         [view] = measurements.views
-        faults = [wiring_error(fault) for fault in wiring_faults(measurements)]
         slopes = {
             "x": slope_of(view.motion, 0),
             "y": slope_of(view.motion, 1),
@@ -773,58 +776,86 @@ class CellCheck:
             if sign_of_lines_is_shown(measurements)
             else None,
         }
+        known_slopes = {
+            axis: slope for axis, slope in slopes.items() if slope is not None
+        }
+        fault = _fault_of_offsets(
+            view.motion,
+            known_slopes,
+            [wiring_error(fault) for fault in wiring_faults(measurements)],
+            has_stops=stops > 0,
+        )
+        follows = fault is None and {"x", "y"} <= known_slopes.keys()
         figure = ", ".join(
-            f"{axis} {slope:+.3f}"
-            for axis, slope in slopes.items()
-            if slope is not None
+            f"{axis} {slope:+.3f}" for axis, slope in known_slopes.items()
         )
-        offsets_follow = slopes["x"] is not None and slopes["y"] is not None
-        what = "; ".join(error.what for error in faults)
-        remedy = "; ".join(error.remedy for error in faults)
-        turned = _turned_deg(view.motion) if stops else None
-        if (
-            turned is not None
-            and abs(turned) > TURNED_DEG
-            and not (faults and abs(turned) > 180 - TURNED_DEG)
-        ):
-            offsets_follow = False
-            what = f"the offsets are turned by {turned:+.1f}° against the stage"
-            remedy = (
-                "publish offsets along the stage's axes: turn the camera back by this angle, "
-                "or state it (detector: turn)"
-            )
-        factor = max(
-            (abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1)
-        )
-        if (
-            offsets_follow
-            and stops
-            and not faults
-            and abs(factor - 1) > block_of_offsets().plausible
-        ):
-            offsets_follow = False
-            what = f"the offsets are {factor:.3g} times as large as the motion of the stage"
-            remedy = (
-                "divide pixel_size by this factor, or find it with selfcal camera init: no "
-                "map would be qualified"
-            )
-        moved_um, seen_um = _spreads_um(view.motion)
-        if stops and not offsets_follow and not what and moved_um > 0:
-            what = (
-                f"the offsets do not follow the stage: between the stops at a mark it moves by "
-                f"{moved_um:.3g} µm rms, they by {seen_um:.3g} µm"
-            )
-            remedy = (
-                "measure the offset anew in each image, and publish it in m: check the unit "
-                "and pixel_size"
-            )
         self._tell(
             "signs",
-            offsets_follow and not faults,
-            what or f"offset against stage {figure or 'not known'} (-1 expected)",
-            remedy or "let the stage stop off the marks: check stops",
+            follows,
+            fault.what
+            if fault
+            else f"offset against stage {figure or 'not known'} (-1 expected)",
+            fault.remedy if fault else "let the stage stop off the marks: check stops",
         )
-        return offsets_follow and not faults, bool(what)
+        return follows, fault is not None
+
+
+def _fault_of_offsets(
+    motion: RepeatMotion | None,
+    slopes: Mapping[str, float],
+    wrong: list[InputError],
+    *,
+    has_stops: bool,
+) -> Fault | None:
+    """Return how the offsets do not follow the stage, if that is shown.
+
+    Parameters
+    ----------
+    motion : RepeatMotion, optional
+        Of stage and offsets between the repeats of marks.
+    slopes : mapping
+        Axis -> response of its offset, where that is known.
+    wrong : list of InputError
+        Wrong signs and scales that are shown.
+    has_stops : bool
+        Whether marks were seen from all four sides.
+    """
+    turned = _turned_deg(motion) if has_stops else None
+    if (
+        turned is not None
+        and abs(turned) > TURNED_DEG
+        and not (wrong and abs(turned) > 180 - TURNED_DEG)
+    ):
+        return Fault(
+            f"the offsets are turned by {turned:+.1f}° against the stage",
+            "publish offsets along the stage's axes: turn the camera back by this angle, "
+            "or state it (detector: turn)",
+        )
+    if wrong:
+        return Fault(
+            "; ".join(error.what for error in wrong),
+            "; ".join(error.remedy for error in wrong),
+        )
+    if not has_stops:
+        return None
+    if not {"x", "y"} <= slopes.keys():
+        moved_um, seen_um = _spreads_um(motion)
+        if not moved_um > 0:
+            return None
+        return Fault(
+            "the offsets do not follow the stage: between the stops at a mark it moves by "
+            f"{moved_um:.3g} µm rms, they by {seen_um:.3g} µm",
+            "measure the offset anew in each image, and publish it in m: check the unit "
+            "and pixel_size",
+        )
+    factor = max((abs(slopes[axis]) for axis in "xy"), key=lambda size: abs(size - 1))
+    if abs(factor - 1) <= block_of_offsets().plausible:
+        return None
+    return Fault(
+        f"the offsets are {factor:.3g} times as large as the motion of the stage",
+        "divide pixel_size by this factor, or find it with selfcal camera init: no "
+        "map would be qualified",
+    )
 
 
 def _spreads_um(motion: RepeatMotion | None) -> tuple[float, float]:

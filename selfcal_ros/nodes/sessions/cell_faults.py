@@ -4,7 +4,7 @@
 Each possible fault is undone in the recorded messages, which are collected again.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from math import degrees, isfinite, nan, pi, radians
@@ -23,19 +23,16 @@ from selfcal_ros.collection.inputs import (
 )
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import wiring_faults
-from selfcal_ros.model.artifact import MAX_GRID_SIZE
+from selfcal_ros.model.artifact import MAX_GRID_SIZE, Artifact
 from selfcal_ros.model.readings import RepeatMotion, Sense
+from selfcal_ros.model.view import View
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.units import MM_PER_M
-
-type Event = EncoderSample | Detection
 
 AT_ONE_PLACE_M = 1e-4
 """Way that is none: the stops beside a mark."""
 STILL = 0.25
 """Part of the pitch within which a stage has not moved."""
-
-
 FOLLOWS = 0.9
 """Fraction of the variance of an offset that must follow the stage for a valid slope."""
 NEAR_FACTOR = 4.0
@@ -44,45 +41,61 @@ least 10, a turn or a wrong size of a pixel less."""
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """The messages of a view: its MEASURE, samples of the encoder, and detections."""
+
+    command: Command
+    samples: Sequence[EncoderSample]
+    detections: Sequence[Detection]
+
+    @property
+    def view(self) -> View:
+        """The view, as it was commanded."""
+        return self.command.placed()
+
+    @property
+    def plate(self) -> Artifact:
+        """Its plate."""
+        return self.command.plate()
+
+
+@dataclass(frozen=True)
 class Fault:
-    """A fault, its remedy, and the messages as they would be without it."""
+    """A fault and its remedy."""
 
     what: str
     remedy: str
-    command: Command
-    events: tuple[Event, ...] = ()
 
 
-def explaining(
-    command: Command, events: Sequence[Event], settings: CollectorSettings
-) -> Fault | None:
+type Tried = Iterator[tuple[Fault, Recorded]]
+"""Faults, each with the messages as they would be without it."""
+
+
+def explaining(recorded: Recorded, settings: CollectorSettings) -> Fault | None:
     """Return the fault without which most of the rejected detections would be used, if any.
 
     Of several, one whose offsets then follow the stage; all of them if nothing tells them apart.
 
     Parameters
     ----------
-    command : Command
-        MEASURE of the view.
-    events : sequence of EncoderSample or Detection
+    recorded : Recorded
         All messages of the view.
     settings : CollectorSettings
         Names of the joints, sense, limits.
     """
-    standing = _standing(command, events, settings)
+    standing = _standing(recorded, settings)
     if standing is not None:
         return standing
-    total = sum(isinstance(event, Detection) for event in events)
-    recorded = _worth(Fault("", "", command, tuple(events)), settings)
+    as_recorded = _worth(recorded, settings)
     faults: list[Fault] = []
-    best = Worth((recorded.used + total) / 2, -np.inf, 0, 0)
-    for fault in _faults(command, events, settings):
+    best = Worth((as_recorded.used + len(recorded.detections)) / 2, -np.inf, 0, 0)
+    for fault, mended in _faults(recorded, settings):
         try:
-            worth = _worth(fault, settings)
+            worth = _worth(mended, settings)
         except InputError:  # an even and an odd side do not lie so
             continue
         # without ids, positions in mm are all those of one mark
-        if worth.seen < recorded.seen:
+        if worth.seen < as_recorded.seen:
             continue
         # any offset is small enough in another unit
         if not worth.following:
@@ -92,14 +105,11 @@ def explaining(
             best = worth
         if worth == best:
             faults.append(fault)
-    return (
-        replace(
-            faults[0],
-            what=", or ".join(fault.what for fault in faults),
-            remedy="; or ".join(fault.remedy for fault in faults),
-        )
-        if faults
-        else None
+    if not faults:
+        return None
+    return Fault(
+        ", or ".join(fault.what for fault in faults),
+        "; or ".join(fault.remedy for fault in faults),
     )
 
 
@@ -124,13 +134,12 @@ class Worth(NamedTuple):
     seen: int
 
 
-def _worth(fault: Fault, settings: CollectorSettings) -> Worth:
-    """Return what the messages would be worth without a fault."""
+def _worth(recorded: Recorded, settings: CollectorSettings) -> Worth:
+    """Return what messages are worth."""
     collector = Collector(settings)
-    collector.add_command(fault.command)
-    samples = [event for event in fault.events if isinstance(event, EncoderSample)]
+    collector.add_command(recorded.command)
     for _, alike in groupby(
-        samples,
+        recorded.samples,
         key=lambda sample: (
             sample.names,
             len(sample.positions),
@@ -138,9 +147,8 @@ def _worth(fault: Fault, settings: CollectorSettings) -> Worth:
         ),
     ):
         collector.add_encoder_block(EncoderBlock.of([*alike]))
-    for event in fault.events:
-        if isinstance(event, Detection):
-            collector.add_detection(event)
+    for detection in recorded.detections:
+        collector.add_detection(detection)
     measurements, progress = collector.collect()
     views = measurements.views
     slopes = [slope_of(view.motion, axis) for view in views for axis in (0, 1)]
@@ -168,41 +176,33 @@ def slope_of(motion: RepeatMotion | None, axis: int) -> float | None:
     return cross / place if cross**2 > FOLLOWS * place * offset else None
 
 
-def _standing(
-    command: Command, events: Sequence[Event], settings: CollectorSettings
-) -> Fault | None:
+def _standing(recorded: Recorded, settings: CollectorSettings) -> Fault | None:
     """Return the fault of a stage that is indicated at one place, or turn, during the view."""
-    plate = command.artifact
-    samples = [event for event in events if isinstance(event, EncoderSample)]
-    places = np.array(
-        [place for sample in samples if (place := _place(sample, settings)) is not None]
-    )
-    if not len(places) or plate is None:
+    plate = recorded.plate
+    indicated = [_place(sample, settings) for sample in recorded.samples]
+    places = np.array([place for place in indicated if place is not None])
+    if not len(places):
         return None
-    way_m = float(np.ptp(places, axis=0).max())
-    if way_m <= STILL * plate.grid_pitch_m:
+    ways_m = np.ptp(places, axis=0).tolist()
+    if max(ways_m) <= STILL * plate.grid_pitch_m:
         x, y = np.median(places, axis=0) * MM_PER_M
         return Fault(
-            f"the stage moves by {way_m * MM_PER_M:.3g} mm alone during the whole view"
-            if way_m > AT_ONE_PLACE_M
+            f"the stage moves by {max(ways_m) * MM_PER_M:.3g} mm alone during the whole view"
+            if max(ways_m) > AT_ONE_PLACE_M
             else f"the stage does not move: it is indicated at x = {x:.6g} mm, "
             f"y = {y:.6g} mm during the whole view",
             "move the stage to each mark, name the joints that move in joint_x and joint_y, "
             "and publish them in m",
-            command,
         )
-    for axis, way in zip("xy", np.ptp(places, axis=0).tolist(), strict=True):
-        if way <= STILL * plate.grid_pitch_m:
+    for axis, way_m in zip("xy", ways_m, strict=True):
+        if way_m <= STILL * plate.grid_pitch_m:
             return Fault(
-                f"{axis} does not move: it is indicated within {way * MM_PER_M:.3g} mm during "
+                f"{axis} does not move: it is indicated within {way_m * MM_PER_M:.3g} mm during "
                 "the whole view",
                 f"move the stage to each mark, and name the joint that moves in joint_{axis}",
-                command,
             )
-    lines = {
-        event.k for event in events if isinstance(event, Detection) and _is_line(event)
-    }
-    _, turns = _turns(samples, settings)
+    lines = {detection.k for detection in _lines(recorded)}
+    _, turns = _turns(recorded.samples, settings)
     if (
         len(lines) > 1
         and len(turns)
@@ -212,7 +212,6 @@ def _standing(
             f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
             "the whole view",
             "turn the stage to each line, and name the joint that turns in joint_theta",
-            command,
         )
     return None
 
@@ -221,71 +220,174 @@ def _place(
     sample: EncoderSample, settings: CollectorSettings
 ) -> tuple[float, float] | None:
     """Return the indicated x and y of a sample that has both, as numbers."""
-    where = dict(zip(sample.names, sample.positions, strict=False))
+    where = sample.by_joint
     x, y = (where.get(joint, nan) for joint in (settings.joint_x, settings.joint_y))
     return (x, y) if isfinite(x) and isfinite(y) else None
 
 
-def _faults(
-    command: Command, events: Sequence[Event], settings: CollectorSettings
-) -> Iterator[Fault]:
+def _lines(recorded: Recorded) -> list[Detection]:
+    """Return the detections that name an angular line."""
+    return [
+        detection
+        for detection in recorded.detections
+        if detection.kind == Kind.ANGULAR and detection.has_id
+    ]
+
+
+def _faults(recorded: Recorded, settings: CollectorSettings) -> Tried:
     """Yield the faults that are tried."""
-    readings = [event for event in events if isinstance(event, Detection)]
-    samples = [event for event in events if isinstance(event, EncoderSample)]
-
-    def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
-        return Fault(what, remedy, command, (*samples, *detections))
-
-    yield from _counts(command, samples, readings, settings, fault)
-    yield fault(
-        "m and n are exchanged",
-        "m counts the marks along plate x, n along plate y",
-        [replace(reading, m=reading.n, n=reading.m) for reading in readings],
+    yield from _counts(recorded)
+    yield from _origins(recorded, settings)
+    yield from _counts_of_lines(recorded, settings)
+    yield (
+        Fault(
+            "m and n are exchanged",
+            "m counts the marks along plate x, n along plate y",
+        ),
+        _with_marks(recorded, [(mark.n, mark.m) for mark in recorded.detections]),
     )
-    for scale, unit in ((1e3, "mm"), (1e6, "µm or pixels")):
-        yield fault(
-            f"the offsets are in {unit}",
-            "publish offset_x and offset_y in m",
-            [
-                replace(
-                    reading,
-                    offset_x=reading.offset_x / scale,
-                    offset_y=reading.offset_y / scale,
-                )
-                for reading in readings
-            ],
-        )
-    places = _places_at(samples, readings, settings)
-    yield fault(
-        "the offsets are places of the marks on the stage",
-        "publish mark - optical axis: leave out the position of the stage",
-        [
-            replace(
-                reading,
-                offset_x=reading.offset_x - place.real,
-                offset_y=reading.offset_y - place.imag,
-            )
-            for reading, place in zip(readings, places, strict=True)
+    yield from _offsets(recorded, settings)
+    yield from _stamps(recorded)
+    yield from _positions(recorded, settings)
+    yield from _placings(recorded)
+
+
+def _with_marks(recorded: Recorded, ids: Sequence[tuple[int, int]]) -> Recorded:
+    """Return the messages with other m and n of the detections."""
+    return replace(
+        recorded,
+        detections=[
+            replace(detection, m=m, n=n)
+            for detection, (m, n) in zip(recorded.detections, ids, strict=True)
         ],
     )
+
+
+def _counts(recorded: Recorded) -> Tried:
+    """Yield that marks are counted in another direction."""
+    for signs, what in (
+        ((-1, 1), "m is counted against plate x"),
+        ((1, -1), "n is counted against plate y"),
+        ((-1, -1), "m and n are counted against plate x and y"),
+    ):
+        even_m, even_n = (
+            sign < 0 and size % 2 == 0
+            for sign, size in zip(signs, recorded.plate.shape, strict=True)
+        )
+        ids = [
+            (signs[0] * mark.m - even_m, signs[1] * mark.n - even_n)
+            for mark in recorded.detections
+        ]
+        yield (
+            Fault(what, "m counts the marks along plate x, n along plate y"),
+            _with_marks(recorded, ids),
+        )
+
+
+def _origins(recorded: Recorded, settings: CollectorSettings) -> Tried:
+    """Yield that marks are counted from another one."""
+    m, n = _other_origin(recorded, settings)
+    if m or n:
+        yield (
+            Fault(
+                "m and n are counted from another mark: the one in the middle is called "
+                f"({m}, {n})",
+                "call the mark in the middle of the plate (0, 0): m and n begin at -(N//2)",
+            ),
+            _with_marks(
+                recorded, [(mark.m - m, mark.n - n) for mark in recorded.detections]
+            ),
+        )
+
+
+def _counts_of_lines(recorded: Recorded, settings: CollectorSettings) -> Tried:
+    """Yield that lines are counted otherwise."""
+    lines, count = _lines(recorded), recorded.plate.angular_count
+    if not lines or not count:
+        return
+    yield (
+        Fault("the lines are counted clockwise", "count k counter-clockwise"),
+        replace(
+            recorded,
+            detections=[
+                replace(detection, k=-detection.k % count)
+                for detection in recorded.detections
+            ],
+        ),
+    )
+    zero = _other_zero(recorded, settings)
+    yield (
+        Fault(
+            f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
+            "count k from the line along plate x, and set theta to 0 where that line is read",
+        ),
+        _turned(recorded, settings, zero_rad=zero),
+    )
+
+
+def _offsets(recorded: Recorded, settings: CollectorSettings) -> Tried:
+    """Yield that offsets are something else."""
+    for scale, unit in ((1e3, "mm"), (1e6, "µm or pixels")):
+        yield (
+            Fault(f"the offsets are in {unit}", "publish offset_x and offset_y in m"),
+            replace(
+                recorded,
+                detections=[
+                    replace(
+                        mark,
+                        offset_x=mark.offset_x / scale,
+                        offset_y=mark.offset_y / scale,
+                    )
+                    for mark in recorded.detections
+                ],
+            ),
+        )
+    places = _places_at(recorded.detections, recorded, settings)
+    yield (
+        Fault(
+            "the offsets are places of the marks on the stage",
+            "publish mark - optical axis: leave out the position of the stage",
+        ),
+        replace(
+            recorded,
+            detections=[
+                replace(
+                    mark,
+                    offset_x=mark.offset_x - place.real,
+                    offset_y=mark.offset_y - place.imag,
+                )
+                for mark, place in zip(recorded.detections, places, strict=True)
+            ],
+        ),
+    )
+
+
+def _stamps(recorded: Recorded) -> Tried:
+    """Yield that detections bear the stamp of another exposure."""
+    marks = recorded.detections
     for late in (1, 2):
         exposures = f"{late} exposure{'s' * (late > 1)}"
-        yield fault(
-            f"each detection shows the mark of {exposures} before its stamp",
-            "stamp detections with the time of the exposure, and read each image once",
-            [
-                replace(reading, stamp_ns=before.stamp_ns)
-                for reading, before in zip(readings[late:], readings, strict=False)
-            ],
-        )
-        yield fault(
-            f"each detection shows the mark of {exposures} after its stamp",
-            "stamp detections with the time of the exposure",
-            [
-                replace(reading, stamp_ns=after.stamp_ns)
-                for reading, after in zip(readings, readings[late:], strict=False)
-            ],
-        )
+        for side, more, detections, stamped in (
+            ("before", ", and read each image once", marks[late:], marks),
+            ("after", "", marks, marks[late:]),
+        ):
+            yield (
+                Fault(
+                    f"each detection shows the mark of {exposures} {side} its stamp",
+                    f"stamp detections with the time of the exposure{more}",
+                ),
+                replace(
+                    recorded,
+                    detections=[
+                        replace(mark, stamp_ns=other.stamp_ns)
+                        for mark, other in zip(detections, stamped, strict=False)
+                    ],
+                ),
+            )
+
+
+def _positions(recorded: Recorded, settings: CollectorSettings) -> Tried:
+    """Yield that positions are indicated otherwise."""
     turns = list(product((1.0,), (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))))
     for scale, swapped, signs in (
         *turns[1:],
@@ -295,118 +397,53 @@ def _faults(
         what, _, remedy = fault_text(
             scale, swapped=swapped, signs=signs, sense=Sense(settings.measurement_sense)
         ).partition("; ")
-        yield Fault(
-            what,
-            remedy,
-            command,
-            (
-                *(
-                    _sample_at(
-                        sample, settings, scale=scale, swapped=swapped, signs=signs
-                    )
-                    for sample in samples
-                ),
-                *readings,
-            ),
-        )
+        samples = [
+            _sample_at(sample, settings, scale=scale, swapped=swapped, signs=signs)
+            for sample in recorded.samples
+        ]
+        yield Fault(what, remedy), replace(recorded, samples=samples)
     for what, remedy, factor in (
         ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
         ("theta is indicated in degrees", "publish theta in rad", radians(1.0)),
     ):
-        yield Fault(
-            what,
-            remedy,
-            command,
-            (
-                *(_turned(sample, settings, factor=factor) for sample in samples),
-                *readings,
-            ),
-        )
-    yield from _placings(command, events)
+        yield Fault(what, remedy), _turned(recorded, settings, factor=factor)
 
 
-def _counts(
-    command: Command,
-    samples: Sequence[EncoderSample],
-    detections: Sequence[Detection],
-    settings: CollectorSettings,
-    fault: Callable[[str, str, Sequence[Detection]], Fault],
-) -> Iterator[Fault]:
-    """Yield that marks or lines are counted otherwise; `fault` makes one of other detections."""
-    view, plate = command.view, command.artifact
-    if view is None or plate is None:
-        return
-    for signs, what in (
-        ((-1, 1), "m is counted against plate x"),
-        ((1, -1), "n is counted against plate y"),
-        ((-1, -1), "m and n are counted against plate x and y"),
-    ):
-        even = [
-            sign < 0 and size % 2 == 0
-            for sign, size in zip(signs, plate.shape, strict=True)
-        ]
-        yield fault(
-            what,
-            "m counts the marks along plate x, n along plate y",
-            [
-                replace(
-                    detection,
-                    m=signs[0] * detection.m - even[0],
-                    n=signs[1] * detection.n - even[1],
-                )
-                for detection in detections
-            ],
-        )
-    shift = _other_origin(command, samples, detections, settings)
-    if any(shift):
-        yield fault(
-            "m and n are counted from another mark: the one in the middle is called "
-            f"({shift[0]}, {shift[1]})",
-            "call the mark in the middle of the plate (0, 0): m and n begin at -(N//2)",
-            [
-                replace(detection, m=detection.m - shift[0], n=detection.n - shift[1])
-                for detection in detections
-            ],
-        )
-    lines = [detection for detection in detections if _is_line(detection)]
-    if not lines or not plate.angular_count:
-        return
-    yield fault(
-        "the lines are counted clockwise",
-        "count k counter-clockwise",
-        [
-            replace(detection, k=-detection.k % plate.angular_count)
-            for detection in detections
-        ],
-    )
-    zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
-    yield Fault(
-        f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
-        "count k from the line along plate x, and set theta to 0 where that line is read",
-        command,
+def _placings(recorded: Recorded) -> Tried:
+    """Yield that the plate lies, or the cell goes, otherwise than commanded."""
+    view, pitch_m = recorded.view, recorded.plate.grid_pitch_m
+    lies = [
+        (f"turned by {deg}°", replace(view, rotation_rad=radians(deg)))
+        for deg in (90, 180, 270)
+    ]
+    lies += [
         (
-            *(_turned(sample, settings, zero_rad=zero) for sample in samples),
-            *detections,
-        ),
-    )
+            f"shifted by {a or b:+d} pitch along {'x' if a else 'y'}",
+            replace(view, translation_m=(a * pitch_m, b * pitch_m)),
+        )
+        for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    for how, other_view in lies:
+        yield (
+            Fault(
+                f"the marks are those of a plate {how}",
+                "place the plate as commanded, and measure the view of the command",
+            ),
+            replace(recorded, command=replace(recorded.command, view=other_view)),
+        )
 
 
-def _other_origin(
-    command: Command,
-    samples: Sequence[EncoderSample],
-    detections: Sequence[Detection],
-    settings: CollectorSettings,
-) -> tuple[int, int]:
+def _other_origin(recorded: Recorded, settings: CollectorSettings) -> tuple[int, int]:
     """Return by how much m and n are usually higher than those of the mark at the axis."""
-    view, plate = command.view, command.artifact
+    view, plate = recorded.view, recorded.plate
     marks = [
         detection
-        for detection in detections
+        for detection in recorded.detections
         if detection.kind == Kind.GRID and detection.has_id
     ]
-    if view is None or plate is None or plate.marks or not marks:
+    if plate.marks or not marks:
         return 0, 0
-    at = _places_at(samples, marks, settings)
+    at = _places_at(marks, recorded, settings)
     at = Sense(settings.measurement_sense).sign * at - complex(*view.translation_m)
     at *= np.exp(-1j * view.rotation_rad) / plate.grid_pitch_m
     off_m, off_n = plate.off_centre
@@ -420,14 +457,12 @@ def _other_origin(
 
 
 def _places_at(
-    samples: Sequence[EncoderSample],
-    detections: Sequence[Detection],
-    settings: CollectorSettings,
+    detections: Sequence[Detection], recorded: Recorded, settings: CollectorSettings
 ) -> np.ndarray:
     """Return x + i y indicated at each detection, complex array, m; NaN if nothing is indicated."""
     places = [
         (sample.stamp_ns, complex(*place))
-        for sample in samples
+        for sample in recorded.samples
         if (place := _place(sample, settings)) is not None
     ]
     if not places:
@@ -437,31 +472,17 @@ def _places_at(
     return np.interp(exposed_ns, stamps, at)
 
 
-def _other_zero(
-    rotation_rad: float,
-    count: int,
-    samples: Sequence[EncoderSample],
-    lines: Sequence[Detection],
-    settings: CollectorSettings,
-) -> float:
+def _other_zero(recorded: Recorded, settings: CollectorSettings) -> float:
     """Return the mean difference of the indicated theta to that of the lines, rad."""
-    stamps, turns = _turns(samples, settings)
+    stamps, turns = _turns(recorded.samples, settings)
     if not turns:
         return 0.0
+    lines = _lines(recorded)
     theta_rad = np.interp([line.stamp_ns for line in lines], stamps, turns)
-    sites = rotation_rad + 2 * pi * np.array([line.k for line in lines]) / count
-    return float(
-        np.angle(
-            np.exp(
-                1j * (theta_rad - Sense(settings.measurement_sense).sign * sites)
-            ).mean()
-        )
-    )
-
-
-def _is_line(event: Detection) -> bool:
-    """Return whether a detection names an angular line."""
-    return event.kind == Kind.ANGULAR and event.has_id
+    line_rad = 2 * pi * np.array([line.k for line in lines])
+    sites = recorded.view.rotation_rad + line_rad / recorded.plate.angular_count
+    off_rad = theta_rad - Sense(settings.measurement_sense).sign * sites
+    return float(np.angle(np.exp(1j * off_rad).mean()))
 
 
 def _turns(
@@ -471,31 +492,27 @@ def _turns(
     turns = [
         (sample.stamp_ns, theta)
         for sample in samples
-        if (
-            theta := dict(zip(sample.names, sample.positions, strict=False)).get(
-                settings.joint_theta
-            )
-        )
-        is not None
+        if (theta := sample.by_joint.get(settings.joint_theta)) is not None
     ]
     return [stamp for stamp, _ in turns], [theta for _, theta in turns]
 
 
 def _turned(
-    sample: EncoderSample,
+    recorded: Recorded,
     settings: CollectorSettings,
     *,
     factor: float = 1.0,
     zero_rad: float = 0.0,
-) -> EncoderSample:
-    """Return a sample with another theta."""
-    return replace(
-        sample,
-        positions=tuple(
-            factor * position - zero_rad if name == settings.joint_theta else position
-            for name, position in zip(sample.names, sample.positions, strict=False)
-        ),
-    )
+) -> Recorded:
+    """Return the messages with another theta."""
+    joint = settings.joint_theta
+    samples = [
+        _indicating(
+            sample, {joint: factor * sample.by_joint.get(joint, nan) - zero_rad}
+        )
+        for sample in recorded.samples
+    ]
+    return replace(recorded, samples=samples)
 
 
 def _sample_at(
@@ -511,42 +528,17 @@ def _sample_at(
     if place is None:
         return sample
     x, y = place[::-1] if swapped else place
-    joint_positions = {
-        settings.joint_x: signs[0] * x / scale,
-        settings.joint_y: signs[1] * y / scale,
-    }
-    return replace(
+    return _indicating(
         sample,
-        positions=tuple(
-            joint_positions.get(name, position)
-            for name, position in zip(sample.names, sample.positions, strict=False)
-        ),
+        {
+            settings.joint_x: signs[0] * x / scale,
+            settings.joint_y: signs[1] * y / scale,
+        },
     )
 
 
-def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
-    """Yield that the plate lies, or the cell goes, otherwise than commanded."""
-    view, plate = command.view, command.artifact
-    if view is None or plate is None:
-        return
-    remedy = "place the plate as commanded, and measure the view of the command"
-    for deg in (90, 180, 270):
-        yield Fault(
-            f"the marks are those of a plate turned by {deg}°",
-            remedy,
-            replace(command, view=replace(view, rotation_rad=radians(deg))),
-            tuple(events),
-        )
-    for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        yield Fault(
-            f"the marks are those of a plate shifted by {a or b:+d} pitch along "
-            f"{'x' if a else 'y'}",
-            remedy,
-            replace(
-                command,
-                view=replace(
-                    view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m)
-                ),
-            ),
-            tuple(events),
-        )
+def _indicating(sample: EncoderSample, at: Mapping[str, float]) -> EncoderSample:
+    """Return a sample with other positions of some joints."""
+    pairs = zip(sample.names, sample.positions, strict=False)
+    positions = tuple(at.get(name, position) for name, position in pairs)
+    return replace(sample, positions=positions)
