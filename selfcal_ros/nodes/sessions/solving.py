@@ -266,6 +266,10 @@ class SolvingSession:
             # the summary shows the number of planned or remaining views
             self._stale = True
 
+    def _is_over(self, run: PlanRun) -> bool:
+        """Return whether DONE was received; commands without a run end all of them."""
+        return bool(self._ended & {run, PlanRun(run.plan_id)})
+
     def _planned_views(self, run: PlanRun) -> int:
         """Return the number of planned views; commands without a run count for all runs."""
         return max(
@@ -408,11 +412,10 @@ class SolvingSession:
     def _verifies_later(self) -> bool:
         """Return whether views of a verification are to come: one says less than all."""
         newest = next(iter(self._messages.values()), None)
-        over = bool(self._ended & {self._run, PlanRun(self._run.plan_id)})
         if (
             newest is None
             or not to_model.plan_keys_of(newest)["verify"]
-            or over
+            or self._is_over(self._run)
             or (self._views_done >= self._planned_views(self._run))
         ):
             return False
@@ -430,9 +433,6 @@ class SolvingSession:
         job = outcome.job
         if job.run != self._run:
             return
-        if outcome.result is None:
-            self._take_none(outcome)
-            return
         self.shown = Shown(
             result=outcome.result,
             problem=outcome.problem,
@@ -441,25 +441,19 @@ class SolvingSession:
             stamp_ns=job.stamp_ns,
             digest=job.digest,
         )
+        if outcome.result is None:
+            self._take_none(outcome.problem)
+            return
         self._saved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
 
-    def _take_none(self, outcome: SolvingOutcome) -> None:
-        """Show why there is no result; raise it unless remaining views may change this."""
-        job = outcome.job
-        self.shown = Shown(
-            result=None,
-            problem=outcome.problem,
-            run=job.run,
-            views_done=job.views_done,
-            stamp_ns=job.stamp_ns,
-            digest=job.digest,
-        )
+    def _take_none(self, problem: Exception | None) -> None:
+        """Publish why there is no result; raise it unless remaining views may change this."""
         self._publish_summary()
         if not self._unfinished():
-            raise outcome.problem or ValueError("neither a result nor a problem")
+            raise problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
 
     def _save_by_itself(self, result: results.CalibrationResult) -> None:
@@ -545,7 +539,7 @@ class SolvingSession:
         """
         run, problem = self.shown.run, self.shown.problem
         to_come = self.shown.views_done < self._planned_views(run)
-        over = bool(self._ended & {run, PlanRun(run.plan_id)})
+        over = self._is_over(run)
         if isinstance(problem, NoDataError):
             return not over or to_come
         return isinstance(problem, NotIdentifiableError) and to_come and not over
