@@ -33,6 +33,15 @@ INPUT_TOPICS = {
 }
 """Type of each input topic."""
 
+REQUESTS = {
+    "start": "start",
+    "confirm": "confirm_view",
+    "redo": "redo_view",
+    "skip": "skip_view",
+    "abort": "abort",
+}
+"""Requests to the sequencer, as a person gives them -> services of pose_sequencer."""
+
 INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
 

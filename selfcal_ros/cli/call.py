@@ -2,21 +2,19 @@
 """``selfcal call``: one request to the sequencer of a cell, and its answer."""
 
 import argparse
-import contextlib
 
 from selfcal_ros.cli.processes import eyes
 from selfcal_ros.cli.terminal import add_json, say
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.portable import ended_by_signals
-
-REQUESTS = ("start", "confirm", "redo", "skip", "abort")
+from selfcal_ros.topics import REQUESTS
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument(
         "request",
-        choices=REQUESTS,
+        choices=tuple(REQUESTS),
         help="start: begin the plan; confirm: the "
         "plate is in place; redo: measure the view again; skip: continue without it; "
         "abort: end the plan",
@@ -29,8 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send the request, print the answer; exit code 2 if it was refused."""
-    with ended_by_signals(), contextlib.ExitStack() as stack:
-        monitor = stack.enter_context(eyes(args.namespace))
+    with ended_by_signals(), eyes(args.namespace) as monitor:
         monitor.ask(args.request)
         for message in monitor.messages():
             if "answer" in message:

@@ -27,10 +27,8 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             raise InputError("bag_player", "no bag is named", "set the parameter 'bag'")
         self.finished = Future()
         self.exit_code = ExitCode.DONE
-        listener, patience_s = (
-            self.settings.listener,
-            self.settings.wait_for_subscribers,
-        )
+        listener = self.settings.listener
+        patience_s = self.settings.wait_for_subscribers
         self.player = Player(
             self,
             self.settings.bag,
@@ -46,14 +44,11 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
 
     def diagnosis(self) -> Diagnosis:
         """Return the progress, and the node it waits for."""
-        level = Level.OK
-        line = "playing"
+        level, line = Level.OK, "playing"
         if not self._started:
-            level = Level.WARN
-            line = self._waits_for()
+            level, line = Level.WARN, self._waits_for()
         elif self.player.stalled_s > STALLED_S:
-            level = Level.WARN
-            line = f"{self.player.listener} takes no more messages"
+            level, line = Level.WARN, f"{self.player.listener} takes no more messages"
         return Diagnosis(
             level, line, {"played": self.player.played, "total": self.player.total}
         )
@@ -87,14 +82,7 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             self.finished.set_result(None)
 
     def _is_heard(self) -> bool:
-        missing = [
-            f"{node} does not listen to {', '.join(topics)}"
-            for node, topics in (
-                (self.player.listener, self.player.unheard()),
-                (self.player.detector, self.player.unseen()),
-            )
-            if topics
-        ]
+        missing = self.player.deaf()
         if missing and time.monotonic() > self._patience:
             raise InputError(
                 "bag_player",

@@ -19,6 +19,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.hearing import publishers_of
 from selfcal_ros.nodes.names import MatchedInput, unheard
 from selfcal_ros.nodes.running import run
 from selfcal_ros.nodes.sessions.cell_check import CellCheck
@@ -75,23 +76,16 @@ class CellChecker(SelfcalNode[CollectorSettings]):
     def _tick(self) -> None:
         if self.finished.done():
             return
-        command_publishers = self.get_publishers_info_by_topic(
-            self.resolve_topic_name(names.COMMAND.name)
-        )
-        if len(command_publishers) > 1:
+        if len(publishers_of(self, names.COMMAND.name)) > 1:
             self.say(
                 Level.ERROR, "another node sends view commands: end the sequencer first"
             )
             self._end(ExitCode.BAD_INPUT)
             return
         for topic in (names.ENCODER.name, names.DETECTIONS.name):
-            nodes = [
-                offer.node_name
-                for offer in self.get_publishers_info_by_topic(
-                    self.resolve_topic_name(topic)
-                )
-            ]
-            self.session.publishers[topic] = sorted(nodes)
+            self.session.publishers[topic] = sorted(
+                publisher.node_name for publisher in publishers_of(self, topic)
+            )
         detections = self.resolve_topic_name(names.DETECTIONS.name)
         found = unheard(self, {detections: names.DETECTIONS})
         self.session.take_health("quality of service", found.level, found.message)

@@ -5,7 +5,7 @@ The listeners of others do not count.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -63,27 +63,14 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
     return matched >= len(readers) and by in [node_of(reader) for reader in readers]
 
 
-def others_on(
-    node: Node, topics: Iterable[str], own_nodes: Iterable[str]
-) -> dict[str, list[str]]:
-    """Return the nodes that publish on topics, with these topics, but not `own`.
+def publishers_of(node: Node, topic: str) -> Sequence[TopicEndpointInfo]:
+    """Return the publishers of a topic that a node sees."""
+    return node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
 
-    Parameters
-    ----------
-    node : Node
-        A node that sees all publishers.
-    topics : iterable of str
-        The topics.
-    own : iterable of str
-        Names of nodes with their namespaces; each may publish on a topic once.
-    """
-    topics_of_node: dict[str, list[str]] = {}
-    allowed = Counter(own_nodes)
-    for topic in topics:
-        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        for name in Counter(map(node_of, offers)) - allowed:
-            topics_of_node.setdefault(name, []).append(topic)
-    return topics_of_node
+
+def others_on(node: Node, topic: str, own_nodes: Iterable[str]) -> Iterable[str]:
+    """Return the nodes that publish on a topic beside `own_nodes`, each of which may once."""
+    return Counter(map(node_of, publishers_of(node, topic))) - Counter(own_nodes)
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str:

@@ -29,14 +29,8 @@ from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.running import run
 from selfcal_ros.nodes.sessions.health import Level, Ports, Refusals
 from selfcal_ros.nodes.sessions.watching import Watch
+from selfcal_ros.topics import REQUESTS
 
-REQUESTS = {
-    "start": "start",
-    "confirm": "confirm_view",
-    "redo": "redo_view",
-    "skip": "skip_view",
-    "abort": "abort",
-}
 WATCHED = (
     "measurement_collector",
     "pose_sequencer",

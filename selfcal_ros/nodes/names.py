@@ -4,7 +4,7 @@
 Names are declared in `topics`.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_check_compatible,
 )
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from selfcal_msgs import msg
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import String, UInt64MultiArray
@@ -25,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
 from selfcal_ros.model.plan_form import MAX_VIEWS
-from selfcal_ros.nodes.hearing import node_of
+from selfcal_ros.nodes.hearing import node_of, publishers_of
 from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 
@@ -178,15 +179,20 @@ def _mismatch(topic: Topic, other: Any, *, publishes: bool) -> str:
 
 def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
     """Name all publishers of a topic that has more than one."""
-    shared_topics = []
-    for topic in topics:
-        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        if len(offers) > 1:
-            shared_topics.append(
-                f"{topic} has {len(offers)} publishers: "
-                f"{', '.join(sorted(map(node_of, offers)))}; only one is allowed"
-            )
-    return Diagnosis.of(shared_topics)
+    offers = {topic: publishers_of(node, topic) for topic in topics}
+    return Diagnosis.of(
+        [
+            f"{_several(topic, publishers)}; only one is allowed"
+            for topic, publishers in offers.items()
+            if len(publishers) > 1
+        ]
+    )
+
+
+def _several(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Return that a topic has several publishers, and who they are."""
+    nodes = ", ".join(sorted(map(node_of, publishers)))
+    return f"{topic} has {len(publishers)} publishers: {nodes}"
 
 
 def rivals(node: Node, topics: Iterable[str]) -> str:
@@ -196,19 +202,13 @@ def rivals(node: Node, topics: Iterable[str]) -> str:
     """
     shared_topics = []
     for topic in topics:
-        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        if (
-            len(
-                {
-                    (node_of(offer), bytes(offer.endpoint_gid[:PARTICIPANT]))
-                    for offer in offers
-                }
-            )
-            > 1
-        ):
-            shared_topics.append(
-                f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(node_of, offers)))}"
-            )
+        publishers = publishers_of(node, topic)
+        nodes = {
+            (node_of(publisher), bytes(publisher.endpoint_gid[:PARTICIPANT]))
+            for publisher in publishers
+        }
+        if len(nodes) > 1:
+            shared_topics.append(_several(topic, publishers))
     return "; ".join(shared_topics)
 
 

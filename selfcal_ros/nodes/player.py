@@ -177,6 +177,17 @@ class Player:
         waits = played and self.taken is None and self._detector_tells()
         return played if waits else self._not_heard(played, self.detector)
 
+    def deaf(self) -> list[str]:
+        """Return which nodes do not listen yet, and to what, one line each."""
+        return [
+            f"{node} does not listen to {', '.join(topics)}"
+            for node, topics in (
+                (self.listener, self.unheard()),
+                (self.detector, self.unseen()),
+            )
+            if topics
+        ]
+
     def _not_heard(self, topics: list[str], by: str) -> list[str]:
         return not_heard(
             self.node, {topic: self._publishers[topic] for topic in topics}, by
@@ -233,8 +244,8 @@ class Player:
         for topic in self.alone_on:
             played = topic in self._publishers and topic != COMMAND_TOPIC
             own_nodes = self._own[:1] if played else self._own
-            for name, topics in others_on(self.node, [topic], own_nodes).items():
-                topics_of_node.setdefault(name, []).extend(topics)
+            for name in others_on(self.node, topic, own_nodes):
+                topics_of_node.setdefault(name, []).append(topic)
         return topics_of_node
 
     def step(self) -> None:

@@ -58,7 +58,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         except SelfcalError as error:
             self._end(str(error), error.exit_code)
         except Exception as error:  # the command waits for the end
-            self._end(f"{type(error).__name__}: {error}", ExitCode.INTERNAL)
+            self._end(f"{type(error).__name__}: {error}")
 
     def _go(self, act: Callable[[], None]) -> None:
         self._act, self._deadline = act, time.monotonic() + PATIENCE_S
@@ -67,22 +67,12 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         return time.monotonic() > self._deadline
 
     def _wait_for_nodes(self) -> None:
-        unheard = [
-            f"{node} does not listen to {', '.join(topics)}"
-            for node, topics in (
-                (self.player.listener, self.player.unheard()),
-                (self.player.detector, self.player.unseen()),
-            )
-            if topics
-        ]
+        deaf = self.player.deaf()
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
-        if self.player.is_alone() and not unheard and ready:
+        if self.player.is_alone() and not deaf and ready:
             self._go(self._play)
         elif self._late():
-            self._end(
-                " and ".join(unheard) or "no services of collector and solver",
-                ExitCode.INTERNAL,
-            )
+            self._end(" and ".join(deaf) or "no services of collector and solver")
 
     def _play(self) -> None:
         self.player.step()
@@ -93,9 +83,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         if self.player.done:
             self._go(self._wait_until_received)
         elif self.player.stalled_s > PATIENCE_S:
-            self._end(
-                f"the nodes take no more messages: {self._counts()}", ExitCode.INTERNAL
-            )
+            self._end(f"the nodes take no more messages: {self._counts()}")
 
     def _wait_until_received(self) -> None:
         if self.player.arrived:
@@ -107,7 +95,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
                 ExitCode.BAD_INPUT,
             )
         elif self._late():
-            self._end(f"messages were lost: {self._counts()}", ExitCode.INTERNAL)
+            self._end(f"messages were lost: {self._counts()}")
 
     def _counts(self) -> str:
         received = (self.player.heard or {}) | {IMAGES: self.player.taken or 0}
@@ -123,7 +111,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             if answer.done():
                 then(answer.result())
             elif self._late():
-                self._end(f"{client.srv_name} does not answer", ExitCode.INTERNAL)
+                self._end(f"{client.srv_name} does not answer")
 
         self._go(wait)
 
@@ -146,15 +134,12 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
                 ),
             )
         elif self._late():
-            self._end(
-                "the solver did not receive the readings of all views",
-                ExitCode.INTERNAL,
-            )
+            self._end("the solver did not receive the readings of all views")
 
     def _on_solved(self, message: Any) -> None:
         self._solved = message.data
 
-    def _end(self, message: str, code: ExitCode) -> None:
+    def _end(self, message: str, code: ExitCode = ExitCode.INTERNAL) -> None:
         if message:
             print(f"selfcal replay: {message}", file=sys.stderr, flush=True)
         for line in self.player.playlist.lost:
