@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import planned_system
@@ -45,12 +44,12 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
 from selfcal_ros.outputs import check_outputs, refuse_existing, utf8, write_together
-from selfcal_ros.plain_numbers import number_of
+from selfcal_ros.plain_numbers import number_of, quantity_of
 from selfcal_ros.reporting.words.observability import (
     describe_view,
     worded_observability,
 )
-from selfcal_ros.units import MM_PER_M, UM_PER_M
+from selfcal_ros.units import M_PER, MM_PER_M, UM_PER_M
 
 REPEATS = {1: "", 2: "there_and_back@plate", 4: "x_back_y_back@plate"}
 """Measurements of a mark in a view -> the order of the visits that completes them."""
@@ -115,14 +114,16 @@ class Known:
 def _length(text: str, option: str) -> float:
     """Return a length with a unit, m."""
     try:
-        value = length_m(text, option)
-    except InputError:
+        value, unit = quantity_of(text, M_PER)
+    except ValueError:
+        value, unit = math.nan, ""
+    if not 0 < value < math.inf:
         raise InputError(
             option,
             f"'{text}' is not a positive length",
             "write a number with m, mm, um or nm, as in 10mm",
-        ) from None
-    if text.strip()[-1:] != "m":
+        )
+    if not unit:
         raise InputError(option, f"'{text}' has no unit", "write for example 10mm")
     return value
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from selfcal_ros.blocks import block_of, blocks
+from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.observability.resistance import PlanBudget, TermCheck
 from selfcal_ros.estimation.terms.planned import Assumed
@@ -17,13 +16,16 @@ from selfcal_ros.model.terms import (
     DRIFT_DEGREE,
     MAX_DRIFT_DEGREE,
     ModelTerm,
+    block_of_offsets,
     default_terms,
     in_order,
     parse_terms,
 )
 from selfcal_ros.model.view import DEFAULT_ORDER, Plan, parse_order
+from selfcal_ros.plain_numbers import quantity_of
 from selfcal_ros.reporting.words.quantities import MRAD, unit_of
 from selfcal_ros.reporting.words.tables import removal_text
+from selfcal_ros.settings.nodes import NO_TERMS
 from selfcal_ros.units import M_PER, RAD_PER, UM_PER_M
 
 SIGMA = "20e-9"
@@ -33,7 +35,6 @@ STAGE_ERROR = "1um"
 PLACING = "0.3deg"
 MOST_M, MOST_RAD = 1e-3, 0.1
 """Largest standard deviations: 20 without a unit is meant in another one."""
-NO_TERMS = "none"
 
 
 def add_term_options(parser: argparse.ArgumentParser) -> None:
@@ -109,13 +110,11 @@ def length_m(text: str, option: str, most: float = math.inf) -> float:
 def _quantity(
     text: str, option: str, units: Mapping[str, float], what: str, most: float
 ) -> float:
-    """Return a positive number with one of the units, the first if none is given."""
-    match = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµμ]*)\s*", text)
+    """Return a positive number with one of the units, SI if none is given."""
     plain = next(iter(units))
-    unit = re.sub("[µμ]", "u", match[2]) or plain if match else ""
     try:
-        value = float(match[1]) * units[unit] if match else math.nan
-    except (ValueError, KeyError):
+        value, _ = quantity_of(text, units)
+    except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
         raise InputError(
@@ -169,7 +168,8 @@ def sizes_of(args: argparse.Namespace) -> dict[str, float]:
     InputError
         For an unknown term or one without a size.
     """
-    terms = parse_terms(_named(args.against), "--against")
+    named = [text for text in args.against if text != NO_TERMS]
+    terms = parse_terms(named, "--against")
     for term in terms:
         if term.free:
             raise InputError(
@@ -182,7 +182,7 @@ def sizes_of(args: argparse.Namespace) -> dict[str, float]:
 
 def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the plan, replaced by those of ``--model``; those of size 0 as well."""
-    if _is_none(args.model):
+    if NO_TERMS in args.model:
         return ()
     term_of = {
         term.name: term
@@ -193,15 +193,6 @@ def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
         for term in terms
     }
     return in_order(term_of.values())
-
-
-def _is_none(texts: list[str]) -> bool:
-    """Return whether an option says that there is no term, not even a default one."""
-    return NO_TERMS in texts
-
-
-def _named(texts: list[str]) -> list[str]:
-    return [text for text in texts if text != NO_TERMS]
 
 
 def assumed_terms(
@@ -218,18 +209,12 @@ def assumed_terms(
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    names = {term.name for term in named} | (
-        {
-            block.name
-            for block in blocks().values()
-            if block.of_microscope and tells_camera(plan)
-        }
-    )
-    return (
-        ()
-        if _is_none(given)
-        else tuple(term for term in default_terms() if term.name not in names)
-    )
+    if NO_TERMS in given:
+        return ()
+    names = {term.name for term in named}
+    if tells_camera(plan):
+        names.add(block_of_offsets().name)
+    return tuple(term for term in default_terms() if term.name not in names)
 
 
 def tells_camera(plan: Plan) -> bool:
@@ -310,17 +295,13 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
         f"{'largest':>10} {'detected':>9}",
     ]
     for c in checks:
-        separable = "yes" if c.determined else f"no, {_modes(c.unseen_modes)}"
+        separable = "yes" if c.determined else f"no, {c.unseen_modes} unseen"
         lines.append(
             f"  {c.name:<13}{c.model or '-':<6}{separable:<14}{size_text(c):>11}"
             f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
             f" {100 * c.power:7.1f} %"
         )
     return [*lines, *_assumptions(plan, assumed)]
-
-
-def _modes(number: int) -> str:
-    return f"{number} unseen"
 
 
 def size_text(check: TermCheck) -> str:

@@ -5,7 +5,7 @@ The correction that makes a commanded position true is c = +G = indicated - true
 section 1). Columns of the 2D table run along x, rows along y.
 """
 
-import re
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,12 +15,13 @@ from selfcal_ros.applications.aerotech.header import ArgumentFault
 from selfcal_ros.applications.aerotech.header import number as plain_number
 from selfcal_ros.applications.aerotech.model import Table1D, Table2D, Unit, UnitWord
 from selfcal_ros.compensation.export import tidy
-from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import require_known
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import csv_rows
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_NM, M_PER_UM, RAD_PER_ARCSEC
+from selfcal_ros.plain_numbers import quantity_of
+from selfcal_ros.units import ARCSEC_PER_DEG, M_PER, M_PER_UM, RAD_PER_ARCSEC
 
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
@@ -121,10 +122,6 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
 
 UNIFORM = 1e-6
 """Largest deviation of measured positions from equal distances, in distances."""
-_LENGTH = re.compile(
-    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)", re.ASCII
-)
-_LENGTH_UNITS_M = {**UNITS_M, "µm": M_PER_UM, "μm": M_PER_UM, "nm": M_PER_NM}
 
 Home = Literal["end", "middle", "middle-balanced"]
 
@@ -139,12 +136,15 @@ class AxisCorrection:
 
 def length_m(text: str, where: str) -> float:
     """Return a length such as 5um or 200mm in m; InputError without number or unit."""
-    match = _LENGTH.fullmatch(text.strip())
-    if match is None or not np.isfinite(float(match[1])):
+    try:
+        value, unit = quantity_of(text, M_PER)
+    except ValueError:
+        value, unit = math.nan, ""
+    if not unit or not math.isfinite(value):
         raise InputError(
             where, f"'{text}' is not a length", "write a number with m, mm, um or nm"
         )
-    return float(match[1]) * _LENGTH_UNITS_M[match[2]]
+    return value
 
 
 def orthogonality(
