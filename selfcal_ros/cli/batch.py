@@ -133,9 +133,9 @@ def run(args: argparse.Namespace) -> int:
 def _worked(
     args: argparse.Namespace,
     bags: Sequence[Path],
-    settings: "BatchSettings",
+    settings: BatchSettings,
     places: Sequence[int],
-) -> dict[int, "Record"]:
+) -> dict[int, Record]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
     records: dict[int, Record] = {}
     workers = check_workers(args.workers)
@@ -163,14 +163,14 @@ def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
     }
 
 
-def _say(record: "Record") -> None:
+def _say(record: Record) -> None:
     if record["exit_code"]:
         line = record["message"]
         where = "" if line.startswith(record["bag"]) else f"{record['bag']}: "
         tell(f"selfcal batch: {where}{line}", sys.stderr)
 
 
-def exit_code(records: Sequence["Record"]) -> int:
+def exit_code(records: Sequence[Record]) -> int:
     """Return 0 if every bag gave a qualified result, else the code of the worst bag.
 
     From bad to worse: not qualified (5), no usable data (4), not identified (3), bad input (2),

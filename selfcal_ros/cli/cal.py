@@ -203,7 +203,7 @@ def _check(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _described(table: "Table1D | Table2D") -> dict:
+def _described(table: Table1D | Table2D) -> dict:
     shape = " x ".join(map(str, table.values.shape[:2]))
     outputs = ", ".join(map(str, table.outputs))
     inputs = " and ".join(map(str, table.inputs))
@@ -239,7 +239,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _setup(args: argparse.Namespace) -> "MachineSetup":
+def _setup(args: argparse.Namespace) -> MachineSetup:
     if args.temperature is not None:
         check_celsius(args.temperature, "--temperature")
     directions = cal_lines.pairs(args.home_direction, "--home-direction")
@@ -398,7 +398,7 @@ def numbered(steps: Sequence[str]) -> list[str]:
     ]
 
 
-def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
+def ready(args: argparse.Namespace) -> tuple[CalibrationResult, int]:
     """Return the result to export, its gaps filled if requested, and their number.
 
     Raises
@@ -462,7 +462,7 @@ def require_same_axes(
         )
 
 
-def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
+def _active(args: argparse.Namespace, frame: MachineFrame) -> Correction | None:
     """Return the correction by the file of ``--onto``."""
     if args.onto is None:
         return None
@@ -557,7 +557,7 @@ def one_axis_text(fit: OneAxisFit) -> str:
     return "\n".join(lines)
 
 
-def figures_of(residuals: "list[Residual]") -> dict:
+def figures_of(residuals: list[Residual]) -> dict:
     """Return the residuals as data, m and rad."""
     return plain(
         {
@@ -572,7 +572,7 @@ def figures_of(residuals: "list[Residual]") -> dict:
     )
 
 
-def residual_text(residuals: "list[Residual]") -> str:
+def residual_text(residuals: list[Residual]) -> str:
     """Return the residuals as a small table: µm, and arcsec for angular lines."""
     lines = [
         f"{'true - commanded, without its constant shift':<48}{'before':>16}{'after':>15}"

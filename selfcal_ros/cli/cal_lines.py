@@ -191,8 +191,8 @@ def add_frame(
 
 
 def frame_of(
-    args: argparse.Namespace, base: "MachineFrame | None" = None
-) -> "MachineFrame":
+    args: argparse.Namespace, base: MachineFrame | None = None
+) -> MachineFrame:
     """Return the frame described by the options, with `base` as default."""
     base = base or MachineFrame()
     changes: dict[str, Any] = {
@@ -298,7 +298,7 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
     parser.set_defaults(run_sub_verb=run)
 
 
-def _frame(args: argparse.Namespace) -> "MachineFrame":
+def _frame(args: argparse.Namespace) -> MachineFrame:
     """Return the frame of the machine; refuse options without effect."""
     if args.force and not args.output:
         raise InputError(
@@ -416,10 +416,10 @@ def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
 
 def _deliver(
     args: argparse.Namespace,
-    line: "AxisCorrection",
-    frame: "MachineFrame",
+    line: AxisCorrection,
+    frame: MachineFrame,
     axes: tuple[Axis, Axis],
-    result: "CalibrationResult | None" = None,
+    result: CalibrationResult | None = None,
 ) -> int:
     """Write the table of a line to a file, or print it; `result` is that of its map."""
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"

@@ -154,7 +154,7 @@ def require_pixels(size_px: float) -> None:
         )
 
 
-def pose_text(camera: "CameraPose", output: str) -> str:
+def pose_text(camera: CameraPose, output: str) -> str:
     """Return a camera in one line."""
     size = with_u(camera.pixel_size_m / M_PER_UM, camera.u_pixel_size_m / M_PER_UM)
     turn = with_u(math.degrees(camera.turn_rad), math.degrees(camera.u_turn_rad))
@@ -167,8 +167,8 @@ def pose_text(camera: "CameraPose", output: str) -> str:
 
 
 def _of_bag(
-    args: argparse.Namespace, detector: "ImageDetector"
-) -> "tuple[np.ndarray, list[np.ndarray]]":
+    args: argparse.Namespace, detector: ImageDetector
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return stage positions and marks of each image of a bag."""
     stamps, track = encoder_track(args.bag)
     exposed, images = [], []
@@ -200,8 +200,8 @@ def _of_bag(
 
 
 def _of_files(
-    args: argparse.Namespace, detector: "ImageDetector"
-) -> "tuple[np.ndarray, list[np.ndarray]]":
+    args: argparse.Namespace, detector: ImageDetector
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return stage positions and marks of each image of a folder."""
     positions, images = [], []
     for number, row in enumerate(read_positions(args.positions, None)):

@@ -116,8 +116,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _from_files(
-    args: argparse.Namespace, detector: "ImageDetector", settings: DetectorSettings
-) -> "Counter[str]":
+    args: argparse.Namespace, detector: ImageDetector, settings: DetectorSettings
+) -> Counter[str]:
     """Write a bag from image files and a table of positions; return problems."""
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")

@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(result)
 
 
-def _wiring(args: argparse.Namespace) -> "Wiring":
+def _wiring(args: argparse.Namespace) -> Wiring:
     count_options = args.counts_per_unit
     args.counts_per_unit = None
     args.unit = args.unit or FORMATS[args.format].unit

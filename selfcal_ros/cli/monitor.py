@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def watch(
-    monitor: "Eyes", log: list[str], step: Callable[[], None], *, as_json: bool = False
+    monitor: Eyes, log: list[str], step: Callable[[], None], *, as_json: bool = False
 ) -> int:
     """Draw the monitor's pictures and forward keys; call `step` several times a second.
 
@@ -57,7 +57,7 @@ def watch(
 
 
 def _watched(
-    monitor: "Eyes",
+    monitor: Eyes,
     log: list[str],
     step: Callable[[], None],
     pressed: Callable[[], list[str]],

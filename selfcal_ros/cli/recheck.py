@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     return solve.run(args)
 
 
-def _awaited(args: argparse.Namespace, plan: "Plan") -> int:
+def _awaited(args: argparse.Namespace, plan: Plan) -> int:
     """Print what can be said before the plate is calibrated."""
     say(
         args,
@@ -54,7 +54,7 @@ def _awaited(args: argparse.Namespace, plan: "Plan") -> int:
     return int(ExitCode.DONE)
 
 
-def planned(args: argparse.Namespace, plan: "Plan") -> int:
+def planned(args: argparse.Namespace, plan: Plan) -> int:
     """Print what views of a known plate will show; for `selfcal plan check`."""
     if args.plan_verb == "suggest":
         raise InputError(

@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
+def _hu(args: argparse.Namespace, workers: int, progress: Progress) -> tuple:
     reproduction = reproduce_hu(
         args.draws, args.seed, workers=workers, progress=progress
     )
@@ -112,7 +112,7 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     )
 
 
-def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
+def _qiao(args: argparse.Namespace, workers: int, progress: Progress) -> tuple:
     reproduction = reproduce_qiao(
         args.draws, args.seed, workers=workers, progress=progress
     )
@@ -140,7 +140,7 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
     )
 
 
-def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
+def _ibaraki(args: argparse.Namespace, workers: int, progress: Progress) -> tuple:
     reproduction = reproduce_ibaraki(args.draws, args.seed, progress=progress)
 
     return (

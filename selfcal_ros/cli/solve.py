@@ -166,7 +166,7 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
     )
 
 
-def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
+def parameters(args: argparse.Namespace) -> tuple[CollectorSettings, SolverSettings]:
     """Return the settings of collector and solver; options take precedence over the file."""
     collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
     solver = node_settings(

@@ -227,7 +227,7 @@ def _refuse_machine(args: argparse.Namespace) -> None:
     )
 
 
-def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> None:
+def _write_cal(args: argparse.Namespace, identified: StepDiagonalResult) -> None:
     """Write the corrections as 1D tables."""
     frame = frame_of(args)
     comments = [
@@ -245,8 +245,8 @@ def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> No
 
 
 def correction_tables(
-    identified: "StepDiagonalResult", frame: "MachineFrame"
-) -> list["Table1D"]:
+    identified: StepDiagonalResult, frame: MachineFrame
+) -> list[Table1D]:
     """Return the 1D tables of all corrections, in the controller's coordinates.
 
     The machine's home is counted from the start of the first block.
@@ -443,7 +443,7 @@ def joints_of(args: argparse.Namespace) -> tuple[str, ...]:
 
 def measurement_from_bag(
     args: argparse.Namespace, steps_m: tuple[float, ...]
-) -> tuple["StepDiagonal", list[str]]:
+) -> tuple[StepDiagonal, list[str]]:
     """Return the measurement in a bag, and warnings.
 
     Raises

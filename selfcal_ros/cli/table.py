@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     return deliver(args, result, content, "csv", kind=kind.lstrip("."))
 
 
-def csv_bytes(result: "CalibrationResult") -> bytes:
+def csv_bytes(result: CalibrationResult) -> bytes:
     """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
     emap, plate = result.error_map, result.artifact
     rows = [",".join(COLUMNS)]
@@ -105,7 +105,7 @@ def _cell(value: float) -> str:
     )
 
 
-def npz_bytes(result: "CalibrationResult") -> bytes:
+def npz_bytes(result: CalibrationResult) -> bytes:
     """Return the maps as arrays by the names of RESULT.json, [i, j] = site i - Nx//2, j - Ny//2."""
     emap, plate = result.error_map, result.artifact
     out = io.BytesIO()

@@ -348,7 +348,7 @@ class ImageCells:
         return [(x, y) for x in range(-hx, hx + 1) for y in range(-hy, hy + 1)]
 
     def step_on_plate(
-        self, cell: tuple[int, int], pose: "Pose", artifact: Artifact
+        self, cell: tuple[int, int], pose: Pose, artifact: Artifact
     ) -> tuple[int, int]:
         """Return the steps (m, n) on a plate from the mark on the axis to that of a cell."""
         step = (
