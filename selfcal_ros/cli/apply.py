@@ -7,7 +7,7 @@ import numpy as np
 
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.cli.deliver import deliver
-from selfcal_ros.cli.terminal import add_json, file_of, warn
+from selfcal_ros.cli.terminal import add_json, add_result, file_of, warn
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import csv_rows, read_text
@@ -25,9 +25,7 @@ ENDS = ("x1", "y1", "x2", "y2")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
-    )
+    add_result(parser)
     parser.add_argument(
         "points",
         metavar="POINTS.csv",

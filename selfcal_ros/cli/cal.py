@@ -36,7 +36,15 @@ from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.applications.controllers.export import WRITTEN_SO, place_to_look
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, warn
+from selfcal_ros.cli.terminal import (
+    add_fill,
+    add_json,
+    busy,
+    exit_code,
+    save_drawing,
+    say,
+    warn,
+)
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MARK, MachineFrame, frame_from_comments
 from selfcal_ros.compensation.plausible import require_plausible
@@ -289,11 +297,7 @@ def add_maps(group: argparse._SubParsersAction) -> None:
         help="1D table for theta, which cannot share a file with a 2D table "
         "(default: FILE_theta.cal)",
     )
-    export.add_argument(
-        "--fill",
-        action="store_true",
-        help="set unknown sites to the mean of their neighbours",
-    )
+    add_fill(export)
     export.add_argument(
         "--onto",
         metavar="ACTIVE.cal",
@@ -495,9 +499,7 @@ def _verify(args: argparse.Namespace) -> int:
         figures |= {"one_axis": plain(asdict(one_axis))}
     say(args, text, figures)
     if args.plot:
-        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
-
-        save_picture(controller_figure(verification), args.plot)
+        save_drawing(controller_figure(verification), args.plot)
     unfit_parts = (
         [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
     )

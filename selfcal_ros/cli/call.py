@@ -4,7 +4,7 @@
 import argparse
 
 from selfcal_ros.cli.processes import eyes
-from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.cli.terminal import add_json, add_namespace, say
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.topics import REQUESTS
@@ -19,9 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "plate is in place; redo: measure the view again; skip: continue without it; "
         "abort: end the plan",
     )
-    parser.add_argument(
-        "--namespace", metavar="NS", default="", help="namespace of the cell"
-    )
+    add_namespace(parser)
     add_json(parser)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from selfcal_ros.cli.camera import pose_text, require_pixels
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
-from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
+from selfcal_ros.cli.terminal import add_json, add_namespace, aside, put, say, tell
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.machine.cell import Cell, connected, read_cell, with_values
 from selfcal_ros.machine.trying import Findings, Trial, values_of
@@ -67,9 +67,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="NODES.yaml",
         help="ROS parameter file; the section of measurement_collector is used",
     )
-    check.add_argument(
-        "--namespace", metavar="NS", default="", help="namespace of the cell"
-    )
+    add_namespace(check)
     check.add_argument(
         "--settle",
         metavar="S",

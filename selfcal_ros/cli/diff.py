@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from selfcal_ros.cli.terminal import busy, say, say_unless_qualified, tell
+from selfcal_ros.cli.terminal import busy, save_drawing, say, say_unless_qualified, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.comparison.maps import (
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
             names=(args.a, args.b),
         )
     if args.plot:
-        _save_picture(args, a, b, difference)
+        _draw(args, a, b, difference)
     say(
         args,
         _text(difference, _grades_text([a, b]), args.artifact),
@@ -123,15 +123,13 @@ def _compare_with_laser(
     return int(ExitCode.DONE)
 
 
-def _save_picture(
+def _draw(
     args: argparse.Namespace,
     a: CalibrationResult,
     b: CalibrationResult,
     difference: MapDifference,
 ) -> None:
     """Draw the difference of two maps, or of two plates."""
-    from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
-
     map_a, map_b = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
     shown = {
         "gx": difference.dx,
@@ -139,7 +137,7 @@ def _save_picture(
         "g_theta": difference.d_theta,
     }
     picture = difference_picture(map_a, map_b, shown, _verdict_text(difference))
-    save_picture(picture, args.plot)
+    save_drawing(picture, args.plot)
 
 
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:

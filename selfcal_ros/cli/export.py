@@ -21,7 +21,14 @@ from selfcal_ros.cli.cal import (
 )
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, exit_code, say, warn
+from selfcal_ros.cli.terminal import (
+    add_fill,
+    add_json,
+    add_result,
+    exit_code,
+    say,
+    warn,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 
@@ -30,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     add = parser.add_argument
     add("format", choices=FORMATS, metavar="|".join(FORMATS), help="the controller")
-    add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    add_result(parser)
     add(
         "-o",
         "--output",
@@ -57,11 +64,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="the controller subtracts the table (beckhoff, siemens: not documented)",
     )
     add("--integers", action="store_true", help="beckhoff before V3.1.3132 / V4.29")
-    add(
-        "--fill",
-        action="store_true",
-        help="set unknown sites to the mean of their neighbours",
-    )
+    add_fill(parser)
     add(
         "--force",
         action="store_true",

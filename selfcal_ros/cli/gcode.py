@@ -19,7 +19,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
-from selfcal_ros.cli.terminal import add_json, file_of, warn
+from selfcal_ros.cli.terminal import add_fill, add_json, add_result, file_of, warn
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     add = parser.add_argument
     add("program", metavar="IN", help="G-code")
-    add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    add_result(parser)
     add(
         "-o",
         "--output",
@@ -60,11 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="decimals of coordinates in mm, one more in inches (default 5)",
     )
-    add(
-        "--fill",
-        action="store_true",
-        help="set unknown sites to the mean of their neighbours",
-    )
+    add_fill(parser)
     add_json(parser)
     add_frame(parser, theta=False, units=("mm", "in"))
 

@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import TextIO
 
 from selfcal_ros.cli import solve, verify
-from selfcal_ros.cli.terminal import add_json, aside, tell
+from selfcal_ros.cli.terminal import add_json, aside, save_drawing, tell
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.errors import InputError, NoDataError
@@ -150,9 +150,6 @@ class Terminal:
 
     def place(self, command: Command) -> None:
         """Say how the plate is to lie, with a picture, and wait."""
-        from selfcal_ros.reporting.figures.paper import (
-            save_picture,
-        )  # matplotlib, a second
         from selfcal_ros.reporting.figures.places import (
             plan_figure,
         )  # with numbers of results
@@ -160,7 +157,7 @@ class Terminal:
         view = command.placed()
         x, y = (value * MM_PER_M for value in view.translation_m)
         picture = f"{self._bag}.placing.png"
-        save_picture(plan_figure(command.plate(), [view]), picture)
+        save_drawing(plan_figure(command.plate(), [view]), picture)
         turn = math.degrees(view.rotation_rad)
         self.say(
             f"place the plate: turned by {turn:g}° counter-clockwise, its centre at "

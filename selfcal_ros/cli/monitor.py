@@ -17,16 +17,14 @@ from typing import Any
 
 from selfcal_ros.cli.processes import Eyes, eyes
 from selfcal_ros.cli.screen import KEYS, saved_as, screen, what_now
-from selfcal_ros.cli.terminal import add_json
+from selfcal_ros.cli.terminal import add_json, add_namespace
 from selfcal_ros.errors import printable
 from selfcal_ros.portable import ended_by_signals
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "--namespace", metavar="NS", default="", help="namespace of the cell"
-    )
+    add_namespace(parser)
     add_json(
         parser, "one JSON object per line: pictures as they change, answers to requests"
     )

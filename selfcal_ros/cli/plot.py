@@ -5,19 +5,23 @@ import argparse
 from pathlib import Path
 
 from selfcal_ros.cli.report import read_truth
-from selfcal_ros.cli.terminal import add_json, busy, say
+from selfcal_ros.cli.terminal import (
+    add_json,
+    add_result,
+    add_truth,
+    busy,
+    save_drawing,
+    say,
+)
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.reporting.figures.maps import map_picture
-from selfcal_ros.reporting.figures.paper import save_picture
 from selfcal_ros.results import read_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
-    )
+    add_result(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -25,11 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="picture to write; its suffix sets the format",
     )
-    parser.add_argument(
-        "--truth",
-        metavar="TRUTH.json",
-        help="known truth to compare with: gx, gy in m, g_theta in rad",
-    )
+    add_truth(parser)
     add_json(parser)
 
 
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
-        save_picture(map_picture(result, truth), args.output)
+        save_drawing(map_picture(result, truth), args.output)
     say(
         args,
         f"written: {args.output}",

@@ -21,8 +21,9 @@ from selfcal_ros.bagio.offline import (
 )
 from selfcal_ros.cli.processes import domain, need_ros, process
 from selfcal_ros.cli.terminal import (
-    add_json,
     add_parameters,
+    add_recorded_namespace,
+    add_solved,
     aside,
     exit_code,
     file_of,
@@ -63,21 +64,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     speed.add_argument(
         "--fast", action="store_true", help="as fast as the nodes can follow"
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="RESULT.json",
-        help="file for the result; - is stdout, and other output goes to stderr",
-    )
-    add_json(parser, "RESULT.json, and the summary on stderr")
+    add_solved(parser)
     parser.add_argument(
         "--params", metavar="NODES.yaml", help="ROS parameter file for the nodes"
     )
-    parser.add_argument(
-        "--namespace",
-        metavar="NAME",
-        help="namespace of the cell's topics, for bags with several cells; / is the root",
-    )
+    add_recorded_namespace(parser)
     parser.add_argument(
         "--domain",
         type=int,

@@ -10,7 +10,14 @@ from selfcal_ros.applications.aerotech.read import load_cal
 from selfcal_ros.applications.aerotech.verify import table_chapter
 from selfcal_ros.applications.standards.chapter import certificate_chapter, certified
 from selfcal_ros.applications.standards.details import read_details
-from selfcal_ros.cli.terminal import add_json, busy, say
+from selfcal_ros.cli.terminal import (
+    add_json,
+    add_result,
+    add_truth,
+    busy,
+    save_drawing,
+    say,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.outputs import can_print_symbols, check_outputs, refuse_existing
@@ -23,9 +30,7 @@ from selfcal_ros.results import read_result
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
-    )
+    add_result(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -35,11 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plot", metavar="MAP.png", help="also write the map as a picture"
     )
-    parser.add_argument(
-        "--truth",
-        metavar="TRUTH.json",
-        help="known truth to compare with: gx, gy in m, g_theta in rad",
-    )
+    add_truth(parser)
     parser.add_argument(
         "--table",
         metavar="FILE.cal",
@@ -84,11 +85,7 @@ def run(args: argparse.Namespace) -> int:
         chapters.append(certificate_chapter(result, details))
     with busy("drawing"):
         if args.plot:
-            from selfcal_ros.reporting.figures.paper import (
-                save_picture,
-            )  # loads matplotlib
-
-            save_picture(map_picture(result, truth), args.plot)
+            save_drawing(map_picture(result, truth), args.plot)
         write_report(
             result, output, truth=truth, more=chapters, about=_about(args, details)
         )

@@ -13,7 +13,7 @@ from selfcal_ros.applications.papers.ibaraki import (
     reproduce_ibaraki,
 )
 from selfcal_ros.applications.papers.qiao import SIZES, qiao_text, reproduce_qiao
-from selfcal_ros.cli.terminal import add_json, late_progress, say
+from selfcal_ros.cli.terminal import add_json, late_progress, save_drawing, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.outputs import creating, write_text
 from selfcal_ros.parallel import Progress, check_workers
@@ -73,12 +73,10 @@ def run(args: argparse.Namespace) -> int:
         {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers},
     )
     if folder is not None:
-        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
-
         write_text(folder / f"{args.paper}.txt", text + "\n")
         for drawing in figures():
             path = folder / f"{drawing.name}.png"
-            save_picture(drawing, path)
+            save_drawing(drawing, path)
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return int(ExitCode.DONE)
 

@@ -12,8 +12,9 @@ from selfcal_ros.bagio.offline import BagSession, bag_input, collect_bag, read_t
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.cli.terminal import (
     Once,
-    add_json,
     add_parameters,
+    add_recorded_namespace,
+    add_solved,
     aside,
     busy,
     exit_code,
@@ -73,13 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> None:
     """Add what `selfcal solve` and `selfcal recheck` have in common, and options as `names`."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="RESULT.json",
-        help="file for the result; - is stdout, and other output goes to stderr",
-    )
-    add_json(parser, "RESULT.json, and the summary on stderr")
+    add_solved(parser)
     add_options(parser, names)
     parser.add_argument(
         "--reference",
@@ -159,11 +154,7 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
         help="standard uncertainties of the microscope's scale, rotation (rad) "
         "and shear (default: 0.01:0.01:0.002)",
     )
-    parser.add_argument(
-        "--namespace",
-        metavar="NAME",
-        help="namespace of the cell's topics, for bags with several cells; / is the root",
-    )
+    add_recorded_namespace(parser)
 
 
 def parameters(args: argparse.Namespace) -> tuple[CollectorSettings, SolverSettings]:

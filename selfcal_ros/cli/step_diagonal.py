@@ -49,7 +49,7 @@ from selfcal_ros.applications.laser.table import (
 from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.terminal import add_json, busy, put, say, tell, warn
+from selfcal_ros.cli.terminal import add_json, busy, put, save_drawing, say, tell, warn
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_yaml, sha256_of
@@ -166,9 +166,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in result["warnings"]:
         warn(args, f"warning: {warning}")
     if args.plot:
-        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
-
-        save_picture(profiles_figure(identified, data), args.plot)
+        save_drawing(profiles_figure(identified, data), args.plot)
     if args.cal:
         _write_cal(args, identified)
     if args.output:

@@ -10,7 +10,7 @@ import numpy as np
 
 from selfcal_ros.cli.arguments import STDOUT
 from selfcal_ros.cli.deliver import deliver
-from selfcal_ros.cli.terminal import add_json, file_of
+from selfcal_ros.cli.terminal import add_json, add_result, file_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs
@@ -35,9 +35,7 @@ KINDS = (".csv", ".npz")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
-    )
+    add_result(parser)
     parser.add_argument(
         "-o",
         "--output",

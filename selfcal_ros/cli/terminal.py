@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, TextIO
 
 from selfcal_ros.cli.arguments import STDOUT
@@ -16,6 +17,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
 from selfcal_ros.portable import fitted
+from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.settings.nodes import overrides_in
 from selfcal_ros.settings.parameter import TYPED, Settings
 
@@ -37,6 +39,58 @@ class Once(argparse.Action):
                 f"argument {option_string}: given as {before} and as {values}; keep one of them"
             )
         setattr(namespace, self.dest, values)
+
+
+def add_result(parser: argparse.ArgumentParser) -> None:
+    """Add the argument of a result that is read."""
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
+    )
+
+
+def add_truth(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--truth``."""
+    parser.add_argument(
+        "--truth",
+        metavar="TRUTH.json",
+        help="known truth to compare with: gx, gy in m, g_theta in rad",
+    )
+
+
+def add_fill(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--fill`` of what needs an error at every site."""
+    parser.add_argument(
+        "--fill",
+        action="store_true",
+        help="set unknown sites to the mean of their neighbours",
+    )
+
+
+def add_namespace(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--namespace`` of a cell that runs."""
+    parser.add_argument(
+        "--namespace", metavar="NS", default="", help="namespace of the cell"
+    )
+
+
+def add_recorded_namespace(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--namespace`` of a cell that was recorded."""
+    parser.add_argument(
+        "--namespace",
+        metavar="NAME",
+        help="namespace of the cell's topics, for bags with several cells; / is the root",
+    )
+
+
+def add_solved(parser: argparse.ArgumentParser) -> None:
+    """Add the options for where a result goes."""
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="RESULT.json",
+        help="file for the result; - is stdout, and other output goes to stderr",
+    )
+    add_json(parser, "RESULT.json, and the summary on stderr")
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
@@ -132,6 +186,13 @@ def put_text(text: str, stream: TextIO) -> None:
 def put(data: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     print(json_text(data))
+
+
+def save_drawing(drawing: Drawing, path: str | Path) -> None:
+    """Write a picture."""
+    from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+
+    save_picture(drawing, path)
 
 
 def file_of(args: argparse.Namespace) -> str | None:

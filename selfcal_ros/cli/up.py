@@ -9,7 +9,7 @@ from pathlib import Path
 
 from selfcal_ros.cli.monitor import watch
 from selfcal_ros.cli.processes import Supervisor, eyes, need_ros, ros_arguments
-from selfcal_ros.cli.terminal import add_json
+from selfcal_ros.cli.terminal import add_json, add_namespace
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import read_cell
 from selfcal_ros.portable import ended_by_signals
@@ -27,9 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--params", metavar="NODES.yaml", help="ROS parameter file for the nodes"
     )
-    parser.add_argument(
-        "--namespace", metavar="NS", default="", help="namespace of the cell"
-    )
+    add_namespace(parser)
     parser.add_argument(
         "--bag", metavar="FOLDER", help="record the session to this new folder"
     )

@@ -5,7 +5,7 @@ import argparse
 
 from selfcal_ros.bagio.offline import bag_input
 from selfcal_ros.cli import solve
-from selfcal_ros.cli.terminal import busy, say, say_unless_qualified
+from selfcal_ros.cli.terminal import busy, save_drawing, say, say_unless_qualified
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.comparison.verification import (
@@ -14,6 +14,7 @@ from selfcal_ros.estimation.comparison.verification import (
 )
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.reporting.figures.maps import verification_picture
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.verification import (
     verification_text,
@@ -59,12 +60,7 @@ def run(args: argparse.Namespace) -> int:
     verified = after.verification
     assert verified is not None
     if args.plot:
-        from selfcal_ros.reporting.figures.maps import (
-            verification_picture,
-        )  # loads matplotlib
-        from selfcal_ros.reporting.figures.paper import save_picture  # likewise
-
-        save_picture(
+        save_drawing(
             verification_picture(before, after, verification, verified.sentence),
             args.plot,
         )
