@@ -38,6 +38,7 @@ from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
 Axis = Literal["x", "y"]
+ACROSS: dict[Axis, Axis] = {"x": "y", "y": "x"}
 _HOMES: dict[Literal["end", "middle", "middle-balanced"], str] = {
     "end": "home at one end of travel",
     "middle": "home in the middle of travel",
@@ -200,7 +201,21 @@ def frame_of(
         for name in ("x_axis", "y_axis", "theta_axis", "unit")
         if getattr(args, name, None) is not None
     }
-    unit_m = LENGTHS_M[changes.get("unit", base.unit)]
+    changes |= _homes(args, LENGTHS_M[changes.get("unit", base.unit)])
+    for name in ("x_axis", "y_axis", "theta_axis"):
+        if not 1 <= changes.get(name, 1) <= 32:
+            raise InputError(
+                f"--{name.replace('_', '-')}",
+                f"{changes[name]} is not in 1..32",
+                "indices in calibration files count from 1",
+            )
+    changes |= _counts(args, changes, changes.get("theta_axis", base.theta_axis))
+    return replace(base, **changes)
+
+
+def _homes(args: argparse.Namespace, unit_m: float) -> dict[str, Any]:
+    """Return where the controller's zeros lie, and which encoders count backwards."""
+    changes: dict[str, Any] = {}
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
         if home is not None and not math.isfinite(home):
@@ -213,17 +228,16 @@ def frame_of(
             changes[f"home_{name}_m"] = home * unit_m
         if getattr(args, f"reverse_{name}", False):
             changes[f"reverse_{name}"] = True
-    for name in ("x_axis", "y_axis", "theta_axis"):
-        if not 1 <= changes.get(name, 1) <= 32:
-            raise InputError(
-                f"--{name.replace('_', '-')}",
-                f"{changes[name]} is not in 1..32",
-                "indices in calibration files count from 1",
-            )
+    return changes
+
+
+def _counts(
+    args: argparse.Namespace, changes: dict[str, Any], theta_axis: int | None
+) -> dict[str, float]:
+    """Return the counts of the theta axis; refuse options of an axis that there is not."""
     counts = numbers(
         getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True
     )
-    theta_axis = changes.get("theta_axis", base.theta_axis)
     for name in ("home_theta_rad", "reverse_theta"):
         if name in changes and theta_axis is None:
             raise InputError(
@@ -231,6 +245,7 @@ def frame_of(
                 "there is no theta axis",
                 "name --theta-axis",
             )
+    of_theta: dict[str, float] = {}
     for axis, count in counts.items():
         if axis != theta_axis:
             raise InputError(
@@ -238,8 +253,8 @@ def frame_of(
                 f"axis {axis} is not the theta axis",
                 f"write {theta_axis}={count:g}" if theta_axis else "name --theta-axis",
             )
-        changes["theta_counts_per_unit"] = count
-    return replace(base, **changes)
+        of_theta["theta_counts_per_unit"] = count
+    return of_theta
 
 
 def add_line_tables(group: argparse._SubParsersAction) -> None:
@@ -298,20 +313,19 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
     parser.set_defaults(run_sub_verb=run)
 
 
-def _frame(args: argparse.Namespace) -> MachineFrame:
-    """Return the frame of the machine; refuse options without effect."""
-    if args.force and not args.output:
+def refuse_idle_force(args: argparse.Namespace, *files: str | None) -> None:
+    """Refuse ``--force`` where no file is written."""
+    if args.force and not any(files):
         raise InputError(
             "--force",
             "it replaces a file, and none is named",
             "name one with -o, or omit it",
         )
-    return frame_of(args)
 
 
 def _orthogonality(args: argparse.Namespace) -> int:
-    frame = _frame(args)
-    across: Axis = "y" if args.along == "x" else "x"
+    refuse_idle_force(args, args.output)
+    frame = frame_of(args)
     measured = (args.measured, args.over, args.travel)
     if args.source is not None:
         if any(measured) or args.home:
@@ -320,11 +334,9 @@ def _orthogonality(args: argparse.Namespace) -> int:
                 "RESULT.json and a measured square exclude each other",
                 "give one of them; --home-x and --home-y place the home position",
             )
-        result = read_result(args.source)
-        if not args.steep:
-            require_plausible(result.error_map, args.source)
+        result = _result(args)
         line = cal_lines.map_orthogonality(result.error_map, args.along)
-        return _deliver(args, line, frame, (args.along, across), result)
+        return _deliver(args, line, frame, ACROSS[args.along], result)
     if None in measured:
         raise InputError(
             "arguments",
@@ -332,6 +344,21 @@ def _orthogonality(args: argparse.Namespace) -> int:
             "give --measured, --over and --travel, or a RESULT.json",
         )
     _refuse_frame(args, "a measured square", "use --home")
+    return _square(args, frame, measured)
+
+
+def _result(args: argparse.Namespace) -> CalibrationResult:
+    """Return the calibration; refuse a map that is steep, unless it is accepted so."""
+    result = read_result(args.source)
+    if not args.steep:
+        require_plausible(result.error_map, args.source)
+    return result
+
+
+def _square(
+    args: argparse.Namespace, frame: MachineFrame, measured: tuple[str, ...]
+) -> int:
+    """Write the table of a precision square, or print that of each home position."""
     measured_m, over_m, travel_m = (
         cal_lines.length_m(text, name)
         for text, name in zip(
@@ -352,7 +379,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
                 "the home position is missing",
                 "give end, middle or middle-balanced",
             )
-        return _deliver(args, line_of[args.home], frame, (args.along, across))
+        return _deliver(args, line_of[args.home], frame, ACROSS[args.along])
     unit_m = UNITS_M[args.unit]
     tables = {
         home: [
@@ -362,7 +389,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
         for home, line in line_of.items()
     }
     lines = [
-        f"correction of {across} over the full travel of {args.along}: "
+        f"correction of {ACROSS[args.along]} over the full travel of {args.along}: "
         f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm"
     ]
     for home, rows in tables.items():
@@ -377,11 +404,11 @@ def _orthogonality(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace) -> int:
-    frame = _frame(args)
+    refuse_idle_force(args, args.output)
+    frame = frame_of(args)
     result = None
-    corrected: Axis = args.along
-    if args.sub_verb == "straightness":
-        corrected = "y" if args.along == "x" else "x"
+    is_straightness = args.sub_verb == "straightness"
+    corrected = ACROSS[args.along] if is_straightness else args.along
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(
             args, "measured errors, whose positions are the controller's own", "omit it"
@@ -390,15 +417,13 @@ def _line(args: argparse.Namespace) -> int:
             read_text(args.source), args.source, frame.unit_m
         )
     else:
-        result = read_result(args.source)
-        if not args.steep:
-            require_plausible(result.error_map, args.source)
+        result = _result(args)
         line = cal_lines.map_line(result.error_map, args.along, corrected)
-    if corrected != args.along:
+    if is_straightness:
         line = cal_lines.without_slope(line)
     if result is None and not args.steep:
         require_plausible_line(line.positions_m, line.corrections_m, args.source)
-    return _deliver(args, line, frame, (args.along, corrected), result)
+    return _deliver(args, line, frame, corrected, result)
 
 
 def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
@@ -418,14 +443,14 @@ def _deliver(
     args: argparse.Namespace,
     line: AxisCorrection,
     frame: MachineFrame,
-    axes: tuple[Axis, Axis],
+    corrected: Axis,
     result: CalibrationResult | None = None,
 ) -> int:
     """Write the table of a line to a file, or print it; `result` is that of its map."""
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [
         f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-        f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
+        f"{args.sub_verb} of {corrected} along {args.along}, from {source}",
         *(
             []
             if result is None
@@ -433,12 +458,12 @@ def _deliver(
         ),
         frame.comment(axes_alone=result is None),
     ]
-    table = line_table(line, frame, along=axes[0], corrected=axes[1])
+    table = line_table(line, frame, along=args.along, corrected=corrected)
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     written = {
         "table": text,
-        "corrects": axes[1],
-        "along": axes[0],
+        "corrects": corrected,
+        "along": args.along,
         "file": None,
         "old_file": None,
     }
@@ -446,7 +471,7 @@ def _deliver(
         backup = replace_files(args, {args.output: text}, [args.source])[args.output]
         say(
             args,
-            f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
+            f"{args.output}: {args.sub_verb} table for {corrected}{replaced(backup)}",
             written | {"file": args.output, "old_file": backup},
         )
     else:

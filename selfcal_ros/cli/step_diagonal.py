@@ -48,7 +48,7 @@ from selfcal_ros.applications.laser.table import (
 )
 from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.cli.cal_lines import add_frame, frame_of
+from selfcal_ros.cli.cal_lines import add_frame, frame_of, refuse_idle_force
 from selfcal_ros.cli.terminal import add_json, busy, put, save_drawing, say, tell, warn
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
@@ -197,32 +197,22 @@ def _check_outputs(args: argparse.Namespace) -> None:
     files = (args.output, args.plot, args.cal, args.truth, args.save_csv)
     check_outputs([args.data, args.simulate], files)
     refuse_existing(filter(None, [args.cal, args.truth]), force=args.force)
-    if args.force and not any(files):
-        raise InputError(
-            "--force",
-            "it replaces a file, and none is named",
-            "name one with -o, or omit it",
-        )
+    refuse_idle_force(args, *files)
     if not args.cal:
-        _refuse_machine(args)
-
-
-def _refuse_machine(args: argparse.Namespace) -> None:
-    """Refuse options of a calibration file if none is written."""
-    refuse_given(
-        args,
-        (
-            "x_axis",
-            "y_axis",
-            "unit",
-            "home_x",
-            "home_y",
-            "reverse_x",
-            "reverse_y",
-        ),
-        "it belongs to a calibration file",
-        "name one with --cal, or omit it",
-    )
+        refuse_given(
+            args,
+            (
+                "x_axis",
+                "y_axis",
+                "unit",
+                "home_x",
+                "home_y",
+                "reverse_x",
+                "reverse_y",
+            ),
+            "it belongs to a calibration file",
+            "name one with --cal, or omit it",
+        )
 
 
 def _write_cal(args: argparse.Namespace, identified: StepDiagonalResult) -> None:
