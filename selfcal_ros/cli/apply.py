@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         unknown=unknown,
         outside=outside,
     )
-    return int(ExitCode.NOT_QUALIFIED) if outside and not edge else code
+    return ExitCode.NOT_QUALIFIED if outside and not edge else code
 
 
 def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:

@@ -157,7 +157,7 @@ def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
     reason = first_line(error) if error is not None else "no outcome"
     return {
         "bag": os.path.realpath(bag),
-        "exit_code": int(ExitCode.INTERNAL),
+        "exit_code": ExitCode.INTERNAL,
         "qualified": None,
         "message": f"{type(error).__name__}: {reason}",
     }
@@ -178,5 +178,5 @@ def exit_code(records: Sequence[Record]) -> int:
     """
     return min(
         (record["exit_code"] for record in records if record["exit_code"]),
-        default=int(ExitCode.DONE),
+        default=ExitCode.DONE,
     )

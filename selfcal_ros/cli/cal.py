@@ -208,7 +208,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.strict and cal.findings:
         first = cal.findings[0]
         raise InputError(f"{args.file}:{first.line}", first.what, first.remedy)
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _described(table: Table1D | Table2D) -> dict:
@@ -244,7 +244,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         raise InputError("--position", "no position given", "write --position 1=10.5")
     corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
     print(json.dumps({str(axis): float(value) for axis, value in corrections.items()}))
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _setup(args: argparse.Namespace) -> MachineSetup:
@@ -537,7 +537,7 @@ def _verify(args: argparse.Namespace) -> int:
             "U of the map: they are not those of this map; check offset, unit and number of rows, "
             "or export them again",
         )
-    return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)
+    return ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE
 
 
 def one_axis_text(fit: OneAxisFit) -> str:

@@ -400,7 +400,7 @@ def _square(
         ]
     data = {"unit": args.unit, "correction_unit": "um", "tables": tables}
     say(args, "\n".join(lines), data)
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _line(args: argparse.Namespace) -> int:
@@ -476,4 +476,4 @@ def _deliver(
         )
     else:
         say(args, text.removesuffix("\n"), written)
-    return int(ExitCode.DONE) if result is None else exit_code(result)
+    return ExitCode.DONE if result is None else exit_code(result)

@@ -38,5 +38,5 @@ def run(args: argparse.Namespace) -> int:
                         "success": bool(message["success"]),
                     },
                 )
-                return int(ExitCode.DONE if message["success"] else ExitCode.BAD_INPUT)
-    return int(ExitCode.INTERNAL)
+                return ExitCode.DONE if message["success"] else ExitCode.BAD_INPUT
+    return ExitCode.INTERNAL

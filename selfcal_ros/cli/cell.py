@@ -105,7 +105,7 @@ def _try(args: argparse.Namespace) -> int:
         marks = _look(args, trial, output)
         if not args.yes and not _agrees(args, trial.step_m):
             say(args, "nothing was moved or written", {"marks": marks})
-            return int(ExitCode.DONE)
+            return ExitCode.DONE
         findings = trial.move()
     values = _keep(cell, findings)
     backlash = {axis: asdict(reversal) for axis, reversal in findings.reversal.items()}
@@ -123,7 +123,7 @@ def _try(args: argparse.Namespace) -> int:
             "notes": list(findings.notes),
         },
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _look(args: argparse.Namespace, trial: Trial, output: str) -> int:

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         )
     for name, result in ((args.a, a), (args.b, b)):
         say_unless_qualified(result, f"selfcal diff: {name}")
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _compare_with_laser(
@@ -120,7 +120,7 @@ def _compare_with_laser(
         {**_laser_json(rows), **_grades([result])},
     )
     say_unless_qualified(result, f"selfcal diff: {args.a}")
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _draw(

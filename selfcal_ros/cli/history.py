@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
             }
         ),
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _activate(folder: Path, path: Path) -> None:

@@ -193,7 +193,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
     else:
         tell("\n".join(_text_of(args, judged)))
     identifiable = judged.check.observability.identifiable
-    return int(ExitCode.DONE if identifiable else ExitCode.NOT_IDENTIFIABLE)
+    return ExitCode.DONE if identifiable else ExitCode.NOT_IDENTIFIABLE
 
 
 def _judged(args: argparse.Namespace, plan: Plan) -> JudgedPlan:
@@ -548,7 +548,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         _show_ranked(args, plan, (now, unit), ranked[:n_shown])
     if args.output:
         write_yaml(args.output, plan_to_dict(best))
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _in_order(plan: Plan, order: str) -> Plan:

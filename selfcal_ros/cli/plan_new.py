@@ -278,7 +278,7 @@ def run(args: argparse.Namespace) -> int:
         "\n".join(_text(answers, plan, prediction, why_not, outputs)),
         _json(answers, plan, prediction, why_not, outputs),
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _answers(args: argparse.Namespace) -> Known:

@@ -83,4 +83,4 @@ def run(args: argparse.Namespace) -> int:
         "\n".join(lines),
         {"written": args.output, "marks": plan.artifact.m.size, "mark_size": size},
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE

@@ -45,4 +45,4 @@ def run(args: argparse.Namespace) -> int:
         f"written: {args.output}",
         {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")},
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE

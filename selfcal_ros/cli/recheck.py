@@ -51,7 +51,7 @@ def _awaited(args: argparse.Namespace, plan: Plan) -> int:
             "predicted": None,
         },
     )
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def planned(args: argparse.Namespace, plan: Plan) -> int:
@@ -98,4 +98,4 @@ def planned(args: argparse.Namespace, plan: Plan) -> int:
         },
     }
     say(args, "\n".join(lines), plain(data))
-    return int(ExitCode.DONE)
+    return ExitCode.DONE

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
             path = folder / f"{drawing.name}.png"
             save_drawing(drawing, path)
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
-    return int(ExitCode.DONE)
+    return ExitCode.DONE
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: Progress) -> tuple:

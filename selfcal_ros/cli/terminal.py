@@ -239,7 +239,7 @@ def exit_code(result: CalibrationResult) -> int:
     The reason is printed in one line on stderr in any case.
     """
     unqualified = say_unless_qualified(result, "selfcal")
-    return int(ExitCode.NOT_QUALIFIED if unqualified else ExitCode.DONE)
+    return ExitCode.NOT_QUALIFIED if unqualified else ExitCode.DONE
 
 
 def say_unless_qualified(result: CalibrationResult, who: str) -> bool:

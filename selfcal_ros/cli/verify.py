@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if not is_believed(after, verification):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
-    return int(ExitCode.DONE if verified.passed else ExitCode.NOT_QUALIFIED)
+    return ExitCode.DONE if verified.passed else ExitCode.NOT_QUALIFIED
 
 
 def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:
