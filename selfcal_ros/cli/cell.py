@@ -11,7 +11,16 @@ from pathlib import Path
 
 from selfcal_ros.cli.camera import pose_text, require_pixels
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
-from selfcal_ros.cli.terminal import add_json, add_namespace, aside, put, say, tell
+from selfcal_ros.cli.terminal import (
+    add_json,
+    add_namespace,
+    aside,
+    is_yes,
+    put,
+    require_person,
+    say,
+    tell,
+)
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.machine.cell import Cell, connected, read_cell, with_values
 from selfcal_ros.machine.trying import Findings, Trial, values_of
@@ -183,13 +192,10 @@ def _found_text(path: str, findings: Findings) -> list[str]:
 
 def _agrees(args: argparse.Namespace, step_m: float) -> bool:
     """Ask whether the stage may move."""
-    if not sys.stdin.isatty():
-        raise InputError(
-            "stdin", "there is nobody to ask: it is not a terminal", "give --yes"
-        )
+    require_person("give --yes")
     tell(f"the stage moves by up to {step_m / M_PER_UM:.4g} µm in x and y", aside(args))
     print("may it? [y/N] ", end="", file=aside(args), flush=True)
-    return input().strip().lower() in ("y", "yes")
+    return is_yes(input())
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -11,7 +11,14 @@ from types import ModuleType
 from typing import TextIO
 
 from selfcal_ros.cli import solve, verify
-from selfcal_ros.cli.terminal import add_json, aside, save_drawing, tell
+from selfcal_ros.cli.terminal import (
+    add_json,
+    aside,
+    is_yes,
+    require_person,
+    save_drawing,
+    tell,
+)
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.errors import InputError, NoDataError
@@ -70,12 +77,8 @@ def run(args: argparse.Namespace) -> int:
     if not (args.resume or plan.verify or bag.exists()):
         _refuse_files(result, report)
     desk = Terminal(args.yes, bag, aside(args))
-    if not args.yes and not sys.stdin.isatty():
-        raise InputError(
-            "stdin",
-            "there is nobody to ask: it is not a terminal",
-            "give --yes where a robot or a simulation places the plate",
-        )
+    if not args.yes:
+        require_person("give --yes where a robot or a simulation places the plate")
     if args.yes and cell.placing == "person":
         raise InputError(
             f"{cell.path}: placing",
@@ -167,15 +170,13 @@ class Terminal:
 
     def may_move(self, text: str) -> bool:
         """Ask."""
-        return self._is_silent or self._ask(f"{text} [y/N] ").lower() in ("y", "yes")
+        return self._is_silent or is_yes(self._ask(f"{text} [y/N] "))
 
     def lies_still(self, view: str) -> bool:
         """Ask."""
-        if self._is_silent:
-            return True
-        return self._ask(
-            f"view '{view}' was interrupted: does the plate lie as it did? [y/N] "
-        ).lower() in ("y", "yes")
+        return self.may_move(
+            f"view '{view}' was interrupted: does the plate lie as it did?"
+        )
 
     def _ask(self, text: str) -> str:
         self.end()

@@ -131,7 +131,9 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
         Options for parameters of the solver -> their names; the others are set by --params alone.
     """
     add_parameters(parser, SolverSettings, names)
-    parser.set_defaults(reference=None, **dict.fromkeys(SOLVER.keys() - names))
+    parser.set_defaults(
+        reference=None, plate_from="", **dict.fromkeys(SOLVER.keys() - names)
+    )
     add_parameters(parser, CollectorSettings, SENSE)
     parser.add_argument(
         "--params",
@@ -167,7 +169,7 @@ def parameters(args: argparse.Namespace) -> tuple[CollectorSettings, SolverSetti
         **given(args, SOLVER),
         **_reference(args.reference),
     )
-    of_plate = {"reference_at"} if getattr(args, "plate_from", "") else set()
+    of_plate = {"reference_at"} if args.plate_from else set()
     for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":
             raise InputError(
@@ -230,8 +232,9 @@ def _reference(text: str | None) -> dict[str, Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
-    plate_from = getattr(args, "plate_from", None)  # of a recheck
-    check_outputs([args.bag, args.params, plate_from], [file_of(args), args.report])
+    check_outputs(
+        [args.bag, args.params, args.plate_from], [file_of(args), args.report]
+    )
     if args.report:
         from selfcal_ros.reporting.report import check_name  # loads every figure
 
@@ -249,9 +252,7 @@ def run(args: argparse.Namespace) -> int:
         for line in rejections(session.measurements.all_rejected(), used):
             warn(args, f"{args.bag}: {line}")
     measurements = _with_map(args, session.measurements)
-    options = solver_options(
-        solver, measurements, plate_from=getattr(args, "plate_from", "")
-    )
+    options = solver_options(solver, measurements, plate_from=args.plate_from)
     if options.plate is not None and args.validate:
         raise InputError(
             "--validate",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from selfcal_ros.cli.arguments import STDOUT
-from selfcal_ros.errors import ExitCode, visible
+from selfcal_ros.errors import ExitCode, InputError, visible
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
@@ -171,6 +171,19 @@ def tell(text: str, stream: TextIO | None = None) -> None:
     stream = stream or sys.stdout
     lines = "\n".join(visible(line) for line in text.split("\n"))
     put_text(fitted(lines, stream), stream)
+
+
+def require_person(remedy: str) -> None:
+    """Refuse to ask where stdin is not a terminal."""
+    if not sys.stdin.isatty():
+        raise InputError(
+            "stdin", "there is nobody to ask: it is not a terminal", remedy
+        )
+
+
+def is_yes(answer: str) -> bool:
+    """Return whether a person agrees."""
+    return answer.strip().lower() in ("y", "yes")
 
 
 def warn(args: argparse.Namespace, text: str) -> None:
