@@ -11,7 +11,7 @@ from typing import Any
 
 from selfcal_ros.cli import plan_new, plan_terms
 from selfcal_ros.cli.recheck import planned
-from selfcal_ros.cli.terminal import busy, late_progress, put, say, tell
+from selfcal_ros.cli.terminal import busy, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import KNOWN
 from selfcal_ros.estimation.observability.plan_check import (
@@ -188,10 +188,7 @@ class JudgedPlan:
 
 def _check(args: argparse.Namespace, plan: Plan) -> int:
     judged = _judged(args, plan)
-    if args.json:
-        put(_json_of(args, judged))
-    else:
-        tell("\n".join(_text_of(args, judged)))
+    say(args, "\n".join(_text_of(args, judged)), _json_of(args, judged))
     identifiable = judged.check.observability.identifiable
     return ExitCode.DONE if identifiable else ExitCode.NOT_IDENTIFIABLE
 
@@ -495,7 +492,6 @@ def _map_text(predicted: Prediction) -> list[str]:
 
 
 def _suggest(args: argparse.Namespace, plan: Plan) -> int:
-
     if args.top is not None and args.views is not None:
         raise InputError(
             "--top", "with --views one plan is found, not a list", "omit it"
@@ -506,49 +502,66 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     check_outputs([args.plan], [args.output])
     plan = _in_order(plan, args.order)
     against = _against(args, plan)
-    datum = ThetaDatum(args.theta_datum)
-    with late_progress("judging plans") as progress:
-        if args.views is not None:
-            angular = (
-                any(view.angular for view in plan.views)
-                and plan.artifact.angular_count > 0
-            )
-            like = [view for view in plan.views if view.grid] or list(plan.views)
-            best, score, search = best_plan(
-                plan.artifact,
-                args.views,
-                angular=angular,
-                criterion=args.criterion,
-                like=replace(like[0], repeats=min(view.repeats for view in like)),
-                datum=datum,
-                against=against,
-                progress=progress,
-            )
-        else:
-            now, ranked = rank_next(
-                plan,
-                criterion=args.criterion,
-                datum=datum,
-                against=against,
-                progress=progress,
-            )
-    # without terms (--against none) and --sigma the figures are gains
-    in_um = bool(against.all_terms) or args.sigma is not None
-    judged = plan if args.views is None else best
-    unit = _averaged_m(judged, plan_terms.assumed_of(args)) if in_um else None
-    if args.views is not None:
-        best = replace(
-            best,
-            plan_id=f"{plan.plan_id}_best{args.views}",
-            model_terms=plan.model_terms,
-        )
-        _show_best(args, best, (score, unit), search_text(search))
-    else:
-        best = replace(plan, views=ranked[0].views)
-        _show_ranked(args, plan, (now, unit), ranked[:n_shown])
+    best = (
+        _next_step(args, plan, against, n_shown)
+        if args.views is None
+        else _best(args, plan, against)
+    )
     if args.output:
         write_yaml(args.output, plan_to_dict(best))
     return ExitCode.DONE
+
+
+def _next_step(
+    args: argparse.Namespace, plan: Plan, against: Against, n_shown: int
+) -> Plan:
+    """Print the best next steps, and return the plan after the first of them."""
+    with late_progress("judging plans") as progress:
+        now, ranked = rank_next(
+            plan,
+            criterion=args.criterion,
+            datum=ThetaDatum(args.theta_datum),
+            against=against,
+            progress=progress,
+        )
+    _show_ranked(
+        args, plan, (now, _shown_noise_m(args, plan, against)), ranked[:n_shown]
+    )
+    return replace(plan, views=ranked[0].views)
+
+
+def _best(args: argparse.Namespace, plan: Plan, against: Against) -> Plan:
+    """Print the best plan of a number of views, and return it."""
+    like = [view for view in plan.views if view.grid] or list(plan.views)
+    with late_progress("judging plans") as progress:
+        best, score, search = best_plan(
+            plan.artifact,
+            args.views,
+            angular=any(view.angular for view in plan.views)
+            and plan.artifact.angular_count > 0,
+            criterion=args.criterion,
+            like=replace(like[0], repeats=min(view.repeats for view in like)),
+            datum=ThetaDatum(args.theta_datum),
+            against=against,
+            progress=progress,
+        )
+    best = replace(
+        best,
+        plan_id=f"{plan.plan_id}_best{args.views}",
+        model_terms=plan.model_terms,
+    )
+    shown = score, _shown_noise_m(args, best, against)
+    _show_best(args, best, shown, search_text(search))
+    return best
+
+
+def _shown_noise_m(
+    args: argparse.Namespace, plan: Plan, against: Against
+) -> float | None:
+    """Return the noise of an averaged reading of the plan, m; None if gains are shown."""
+    # without terms (--against none) and --sigma
+    in_um = bool(against.all_terms) or args.sigma is not None
+    return _averaged_m(plan, plan_terms.assumed_of(args)) if in_um else None
 
 
 def _in_order(plan: Plan, order: str) -> Plan:
@@ -644,21 +657,18 @@ def _show_best(
 
 
 def _score_json(score: PlanScore, noise_m: float | None) -> dict[str, Any]:
-    def number(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     out = {
         "deficiency": score.deficiency,
-        "rms_gain_xy": number(score.rms_xy),
-        "max_gain_xy": number(score.max_xy),
-        "rms_gain_theta": number(score.rms_theta),
+        "rms_gain_xy": score.rms_xy,
+        "max_gain_xy": score.max_xy,
+        "rms_gain_theta": score.rms_theta,
     }
     if noise_m is not None:
         out |= {
-            "u_rms_m": number(score.rms_xy * noise_m),
-            "u_max_m": number(score.max_xy * noise_m),
+            "u_rms_m": score.rms_xy * noise_m,
+            "u_max_m": score.max_xy * noise_m,
         }
-    return out
+    return plain(out)
 
 
 def _score_text(score: PlanScore, noise_m: float | None) -> str:
