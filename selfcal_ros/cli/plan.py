@@ -335,7 +335,7 @@ def _text_of(args: argparse.Namespace, judged: JudgedPlan) -> list[str]:
 def _check_text(
     plan: Plan, checked: PlanCheck, predicted: Prediction | None
 ) -> list[str]:
-    artifact = plan.artifact
+    artifact, image = plan.artifact, plan.image
     observability = checked.observability
     marks = (
         f"{artifact.shape[0]} x {artifact.shape[1]}"
@@ -346,7 +346,7 @@ def _check_text(
         f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of {marks} marks, "
         f"{artifact.angular_count or 'no'} angular lines",
         *_nodes_text(plan),
-        *_image_text(plan),
+        *([f"images of {image.nx} x {image.ny} marks"] if image else []),
         _rank_text(observability),
     ]
     if predicted is None or not observability.identifiable:
@@ -415,11 +415,6 @@ def _nodes_text(plan: Plan) -> list[str]:
         if plan.artifact.harmonics
         else []
     )
-
-
-def _image_text(plan: Plan) -> list[str]:
-    image = next((view.image for view in plan.views if view.image), None)
-    return [f"images of {image.nx} x {image.ny} marks"] if image else []
 
 
 def _check_stops_text(plan: Plan) -> str:

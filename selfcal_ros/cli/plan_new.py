@@ -110,6 +110,21 @@ class Known:
     seconds: float
     machine: str
 
+    @property
+    def is_simulated(self) -> bool:
+        """Whether the machine is a simulation."""
+        return self.machine == "simulated"
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether the camera sees several marks at once."""
+        return any(self.field)
+
+    @property
+    def mark_size_m(self) -> float:
+        """The size of a mark, the default of `selfcal plate`."""
+        return self.pitch / 5
+
 
 def _length(text: str, option: str) -> float:
     """Return a length with a unit, m."""
@@ -255,8 +270,7 @@ def run(args: argparse.Namespace) -> int:
         refuse_existing([path, cell_path], force=args.force)
     answers = _answers(args)
     artifact = _artifact(answers)
-    simulated = answers.machine == "simulated"
-    outputs = [path, cell_path, *([simulation] if simulated else [])]
+    outputs = [path, cell_path, *([simulation] if answers.is_simulated else [])]
     check_outputs([], outputs)
     refuse_existing(outputs, force=args.force)
     with late_progress("judging plans") as progress:
@@ -266,7 +280,7 @@ def run(args: argparse.Namespace) -> int:
         path: yaml_text(plan_to_dict(plan)),
         cell_path: _cell_text(answers, simulation.name),
     }
-    if simulated:
+    if answers.is_simulated:
         folder = path.resolve().parent
         named = (
             path.name if folder == simulation.resolve().parent else str(path.resolve())
@@ -333,7 +347,7 @@ def _answer_to(item: Question) -> Any:
 
 
 def _artifact(answers: Known) -> Artifact:
-    if answers.lines and any(answers.field):
+    if answers.lines and answers.has_camera:
         raise InputError(
             "--lines",
             "lines are not found in images, and a camera is given",
@@ -621,7 +635,7 @@ def _cell_text(answers: Known, simulation: str) -> str:
     """Return CELL.yaml, the places to be edited named in comments."""
     machine_keys = (
         f"{{simulation: {simulation}}}"
-        if answers.machine == "simulated"
+        if answers.is_simulated
         else f"{OWN_KEYS.get(answers.machine, '{}')}  # edit these"
     )
     x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in answers.travel)
@@ -634,25 +648,17 @@ def _cell_text(answers: Known, simulation: str) -> str:
         "origin: {x: 0.0, y: 0.0}  # what it indicates at the centre of the field, m",
         "sense: microscope_moves  # plate_moves where the stage carries the plate",
     ]
-    if any(answers.field) or answers.machine != "simulated":
-        size = _mark_size_m(answers)
+    if answers.has_camera or not answers.is_simulated:
+        size = answers.mark_size_m
         pixel = (
-            f", pixel_size: {size / PIXELS_A_MARK:.6g}"
-            if answers.machine == "simulated"
-            else ""
+            f", pixel_size: {size / PIXELS_A_MARK:.6g}" if answers.is_simulated else ""
         )
         lines.append(
             f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
             "`selfcal cell try` finds pixel size, turn and mirror"
         )
-    placing = (
-        "robot  # the simulation" if answers.machine == "simulated" else answers.placing
-    )
+    placing = "robot  # the simulation" if answers.is_simulated else answers.placing
     return "\n".join([*lines, "settle: {time: 0.0}  # s", f"placing: {placing}", ""])
-
-
-def _mark_size_m(answers: Known) -> float:
-    return answers.pitch / 5  # the default of `selfcal plate`
 
 
 def _simulation(answers: Known, plan: str) -> dict[str, Any]:
@@ -666,14 +672,14 @@ def _simulation(answers: Known, plan: str) -> dict[str, Any]:
         },  # pitches: a smooth stage, as stages are
         "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6},
     }
-    if any(answers.field):
-        pixel_m = _mark_size_m(answers) / PIXELS_A_MARK
+    if answers.has_camera:
+        pixel_m = answers.mark_size_m / PIXELS_A_MARK
         width, height = (round(side / pixel_m) for side in answers.field)
         out["camera"] = {
             "width": width,
             "height": height,
             "pixel_size": pixel_m,
-            "mark_size": _mark_size_m(answers),
+            "mark_size": answers.mark_size_m,
         }
     return out
 
@@ -734,8 +740,8 @@ def _text(
             f"{100 * (1 - factor):.0f} % smaller and takes {longer:.0f} minutes more"
         )
     yield f"written: {', '.join(map(str, outputs))}"
-    tried = "" if answers.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
-    yes = " --yes" if answers.machine == "simulated" else ""
+    tried = "" if answers.is_simulated else f"selfcal cell try {outputs[1]}; "
+    yes = " --yes" if answers.is_simulated else ""
     yield (
         f"next: selfcal plate {outputs[0]} -o plate.svg; {tried}"
         f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}"

@@ -306,14 +306,13 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     artifact = plan.artifact
     map_fields = map_to_dict(plan.artifact)
     marks, offset_m = plan.check_stops
-    image = next((view.image for view in plan.views if view.image), None)
     return {
         "plan_id": plan.plan_id,
         "artifact": artifact_to_dict(artifact),
         **({"map": map_fields} if map_fields else {}),
         "views": [view_to_dict(view, artifact) for view in plan.views],
         **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
-        **({"image": dict(vars(image))} if image else {}),
+        **({"image": dict(vars(plan.image))} if plan.image else {}),
         **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
         **({"artifact_from": plan.artifact_from} if plan.artifact_from else {}),
         **{key: text for key, text in plan_keys(plan).items() if text},

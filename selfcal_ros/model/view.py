@@ -474,3 +474,8 @@ class Plan:
             (view.check_marks, view.check_offset_m) for view in self.views if view.grid
         )
         return next(checks, (0, 0.0))
+
+    @property
+    def image(self) -> ImageCells | None:
+        """The marks that an image shows; None where every mark is seen alone."""
+        return next((view.image for view in self.views if view.image), None)
