@@ -259,6 +259,13 @@ def block_handlers(
     }
 
 
+def take_all(reader: BagReader, collector: Collector, complaints: list[str]) -> None:
+    """Pass all that a bag has to a collector; `complaints` as of `block_handlers`."""
+    take = block_handlers(collector, complaints)
+    for topic, item in reader.columns():
+        take[topic](item)
+
+
 def bag_input(path: str | Path) -> dict[str, str]:
     """Return the result's ``input`` entry: file name and SHA-256 of the bag's MCAP files."""
     digest = hashlib.sha256()

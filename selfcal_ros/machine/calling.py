@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calls of drivers and classes of others: whatever they raise becomes a `MachineError`."""
 
+import contextlib
 import sysconfig
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +65,14 @@ def called(
         raise MachineError(
             f"{type(error).__name__}: {first_line(error)}{place}", where, remedy
         ) from error
+
+
+@contextlib.contextmanager
+def stopping_on_error(stop: Callable[[], None]) -> Iterator[None]:
+    """Stop a machine whose move fails."""
+    try:
+        yield
+    except MachineError:
+        with contextlib.suppress(MachineError):  # the caller stops as well
+            stop()
+        raise

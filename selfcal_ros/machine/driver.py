@@ -13,7 +13,7 @@ from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again, Duty
-from selfcal_ros.machine.interface import Machine, MachineError, Placing
+from selfcal_ros.machine.interface import Machine, MachineError
 from selfcal_ros.machine.measuring import place_by_robot
 from selfcal_ros.machine.visiting import Event, Visitor
 
@@ -168,14 +168,8 @@ class Driver:
             self.problem = ""
 
     def _place(self, command: Command) -> None:
-        view = command.placed()
-        x, y = view.translation_m
         self._unplaced = True
-        place_by_robot(
-            self._machine,
-            self._cell,
-            Placing(view.name, x, y, view.rotation_rad, command),
-        )
+        place_by_robot(self._machine, self._cell, command)
         self._unplaced = False
 
     def _measure(self, command: Command, again: Again | None) -> None:

@@ -7,13 +7,13 @@ G53 where the dialect has it. Modes of units, distances and feeds are set anew b
 pendant, another program, or a start-up line of GRBL after a reset may have changed them.
 """
 
-import contextlib
 import math
 import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from selfcal_ros.machine.calling import stopping_on_error
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.lines import Lines
 from selfcal_ros.units import M_PER_MM, MM_PER_M
@@ -96,7 +96,7 @@ class GcodeMachine:
                 f"a feed of {feed} mm/min", "gcode: feed", "give mm/min above 0"
             )
         self.axes = tuple(axes)
-        self._feed, self._dialect = float(feed), dialect
+        self._feed = float(feed)
         self._camera = None
         self._lines = Lines(port, baud, PATIENCE_S)
         try:
@@ -131,12 +131,8 @@ class GcodeMachine:
             for axis, value in zip(self.axes, native, strict=True)
         )
         longest_s = ALLOWANCE * way / self._feed * 60 + PATIENCE_S
-        try:
+        with stopping_on_error(self.stop):
             self._talk.move(_Travel(f"{words} F{self._feed:g}", longest_s))
-        except MachineError:
-            with contextlib.suppress(MachineError):  # the caller stops as well
-                self.stop()
-            raise
 
     def image(self) -> Image | None:
         """Expose; None without a camera."""

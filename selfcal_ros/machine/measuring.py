@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from selfcal_ros.bagio.journal import Claim, Journal, create, remove_unbegun
-from selfcal_ros.bagio.offline import block_handlers
+from selfcal_ros.bagio.offline import take_all
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import cdr_bytes
 from selfcal_ros.collection.collector import Collector
@@ -31,6 +31,7 @@ from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.contradicting import LEAST_VISITS, Contradiction, contradiction
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
+from selfcal_ros.machine.seeing import commonest_rejections
 from selfcal_ros.machine.visiting import Event, Visitor, message_of, stops
 from selfcal_ros.model.readings import (
     REPEAT_OUTLIER,
@@ -231,10 +232,7 @@ class Run:
         self._journal = Claim(self.bag).resume()
         if self._journal is not None:
             self._declare()
-        lost: list[str] = []
-        feed = block_handlers(self.collector, lost)
-        for topic, item in BagReader(self.bag).columns():
-            feed[topic](item)
+        take_all(BagReader(self.bag), self.collector, [])
         last = self.collector.newest_command
         if last is not None and not self._is_planned(last):
             raise InputError(
@@ -288,16 +286,8 @@ class Run:
     def _place(self) -> None:
         """Have the plate placed; the stage does not move meanwhile."""
         command = self._sequencer_command()
-        view = command.placed()
         if self.cell.placing == "robot":
-            placing = Placing(
-                view.name,
-                view.translation_m[0],
-                view.translation_m[1],
-                view.rotation_rad,
-                command,
-            )
-            place_by_robot(self.machine, self.cell, placing)
+            place_by_robot(self.machine, self.cell, command)
         else:
             self.desk.place(command)
 
@@ -339,7 +329,7 @@ class Run:
         finding = findings.get(progress.view_index) or findings.get(None)
         if finding:
             return f": {finding}", ""
-        return _rejected(progress), (
+        return commonest_rejections(progress.readings.rejected), (
             "clean the plate there, check light and focus; a plate that lacks these marks is "
             "a list of the others in the plan (artifact: {marks: marks.csv})"
         )
@@ -356,9 +346,7 @@ class Run:
         everything = Collector(
             replace(collector_settings(self.cell), outlier_limit=0.0)
         )
-        feed = block_handlers(everything, [])
-        for topic, item in BagReader(self.bag).columns():
-            feed[topic](item)
+        take_all(BagReader(self.bag), everything, [])
         return everything.collect()[1][index].readings.visits
 
     def _progress(self) -> ViewProgress:
@@ -517,7 +505,7 @@ def _feed(collector: Collector, event: Command | Event) -> None:
         collector.add_encoder(event)
 
 
-def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
+def place_by_robot(machine: Machine, cell: Cell, command: Command) -> None:
     """Have the plate placed by the cell's program, or by the machine itself.
 
     Raises
@@ -525,6 +513,8 @@ def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
     MachineError
         If the program fails, or there is nobody to place.
     """
+    view = command.placed()
+    placing = Placing(view.name, *view.translation_m, view.rotation_rad, command)
     if not cell.place_command:
         place: Callable[[Placing], None] | None = getattr(machine, "place", None)
         if place is None:
@@ -569,14 +559,3 @@ def _named(progress: ViewProgress) -> str:
         return "check stops"
     omission = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + omission
-
-
-def _rejected(progress: ViewProgress) -> str:
-    commonest = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[
-        :3
-    ]
-    return (
-        f" (rejected: {', '.join(f'{name} {count}' for name, count in commonest)})"
-        if commonest
-        else ""
-    )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import first_line
-from selfcal_ros.machine.calling import called
+from selfcal_ros.machine.calling import called, stopping_on_error
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.video import grey
 from selfcal_ros.units import M_PER_UM, MS_PER_S, UM_PER_M
@@ -155,12 +155,8 @@ class MicroManagerMachine:
             x * UM_PER_M,
             y * UM_PER_M,
         )
-        try:
+        with stopping_on_error(self.stop):
             self._call("the move", self._core.waitForDevice, self._stage)
-        except MachineError:
-            with contextlib.suppress(MachineError):  # the caller stops as well
-                self.stop()
-            raise
 
     def image(self) -> Image:
         """Expose and return the image; the caller stamps the middle of the call."""

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The machine ``ophyd``: motors and detectors of ophyd, as laboratories drive them (EPICS, ...)."""
 
-import contextlib
 import importlib
 import inspect
 import math
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import first_line
-from selfcal_ros.machine.calling import called
+from selfcal_ros.machine.calling import called, stopping_on_error
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.video import grey
 from selfcal_ros.units import M_PER, RAD_PER
@@ -104,7 +103,7 @@ class OphydMachine:
 
     def move_to(self, position: tuple[float, ...]) -> None:
         """Start all axes, and wait for all."""
-        try:
+        with stopping_on_error(self.stop):
             waiting = [
                 (
                     axis,
@@ -114,10 +113,6 @@ class OphydMachine:
             ]
             for axis, status in waiting:
                 _called(axis, status.wait, timeout=self._timeout_s)
-        except MachineError:
-            with contextlib.suppress(MachineError):  # the caller stops as well
-                self.stop()
-            raise
 
     def image(self) -> Image | None:
         """Trigger the detector and return its image; None without one."""

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a machine sees: images or offsets into detections; images that cannot be trusted."""
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,15 +46,10 @@ class Eye:
     @property
     def why(self) -> str:
         """What the detector rejected, to be appended to a sentence."""
-        counts = self._detector.counts if self._detector else None
-        if counts is None or not counts.rejected:
-            return ""
         return (
-            " (rejected: "
-            + ", ".join(
-                f"{reason} {count}" for reason, count in counts.rejected.most_common(3)
-            )
-            + ")"
+            commonest_rejections(self._detector.counts.rejected)
+            if self._detector
+            else ""
         )
 
     def require(self, artifact: Artifact) -> None:
@@ -157,6 +154,13 @@ class Eye:
                 "check light, shutter, lens cap and exposure time, and full_scale of the detector",
             )
         return Picture(pixels, int(np.iinfo(pixels.dtype).max))
+
+
+def commonest_rejections(rejected: Mapping[str, int]) -> str:
+    """Return the commonest reasons for rejections, to be appended to a sentence."""
+    commonest = Counter(rejected).most_common(3)
+    reasons = ", ".join(f"{reason} {count}" for reason, count in commonest)
+    return f" (rejected: {reasons})" if reasons else ""
 
 
 def _kind_text(kind: tuple[object, ...]) -> str:

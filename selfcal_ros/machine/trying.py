@@ -225,7 +225,7 @@ class Trial:
         visitor = self._visitor
         visitor.first_move(marks=False, step_m=self.step_m)
         start = visitor.sample()
-        self._home = dict(zip(start.names, start.positions, strict=True))
+        self._home = start.by_joint
         has_image = self.seen is not None
         self._per_pixel: Callable[[np.ndarray], np.ndarray] = lambda offset: offset
         camera = self._camera() if has_image else None

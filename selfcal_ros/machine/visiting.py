@@ -419,7 +419,7 @@ class Visitor:
         """
         last = self._last
         departure = self._where_it_was_left()
-        start = dict(zip(self.axes, departure.positions, strict=True))
+        start = departure.by_joint
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
             target = target | {
@@ -504,10 +504,7 @@ class Visitor:
             self.clock.sleep(self.step_ns / 2 / NS_PER_S)
             now = self.sample()
             motion = _difference(before, now)
-            away = {
-                axis: value - goal[axis]
-                for axis, value in zip(self.axes, now.positions, strict=True)
-            }
+            away = {axis: value - goal[axis] for axis, value in now.by_joint.items()}
             self._check_limits(start, goal, now)
             rests = self._rests(motion)
             arrived = all(
@@ -539,7 +536,7 @@ class Visitor:
         self, start: Position, goal: Position, now: EncoderSample
     ) -> None:
         """Raise if an axis leaves its limits, beyond where it was and where it is to go."""
-        for axis, value in zip(self.axes, now.positions, strict=True):
+        for axis, value in now.by_joint.items():
             low, high = self.cell.limits.get(axis, (-math.inf, math.inf))
             indicated, *ends = (
                 self.cell.to_machine(axis, place)
@@ -732,7 +729,7 @@ class Visitor:
         step = step_m or self.cell.first_step_m
         start = self.sample()
         self._last = start
-        home = dict(zip(self.axes, start.positions, strict=True))
+        home = start.by_joint
         for axis in ("x", "y", "theta") if turns else ("x", "y"):
             low, high = self.cell.limits[axis]
             length = FIRST_TURN_RAD if axis == "theta" else step
@@ -742,10 +739,7 @@ class Visitor:
             marks_before = self.marks() if sees else []
             arrival = self.go({axis: home[axis] + inward})
             if sees:
-                step_done = (
-                    dict(zip(self.axes, arrival.positions, strict=True))[axis]
-                    - home[axis]
-                )
+                step_done = arrival.by_joint[axis] - home[axis]
                 self._check_marks(
                     axis, step_done, marks_before, self.marks(), self.marks()
                 )

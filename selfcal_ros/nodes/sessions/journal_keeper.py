@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from selfcal_ros.bagio import journal as journals
-from selfcal_ros.bagio.offline import block_handlers
+from selfcal_ros.bagio.offline import take_all
 from selfcal_ros.bagio.reader import BagReader, step_watches
 from selfcal_ros.collection.clock_steps import ClockStep
 from selfcal_ros.collection.collector import Collector
@@ -62,15 +62,13 @@ def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
     lost: list[str] = []
     refused: list[InputError] = []
     steps: dict[str, list[ClockStep]] = {}
-    feed = block_handlers(collector, lost)
     watches = step_watches(settings.clock_limit)
     for file in files:
         try:
             reader = BagReader(
                 file, clock_limit_s=settings.clock_limit, watches=watches
             )
-            for topic, item in reader.columns():
-                feed[topic](item)
+            take_all(reader, collector, lost)
             lost += reader.lost
             for topic, stamped_steps in reader.steps.items():
                 steps.setdefault(topic, []).extend(stamped_steps)
