@@ -41,6 +41,7 @@ from selfcal_ros.cli.terminal import (
     add_json,
     busy,
     exit_code,
+    option_of,
     save_drawing,
     say,
     warn,
@@ -261,7 +262,7 @@ def _setup(args: argparse.Namespace) -> MachineSetup:
     values_of: dict[str, dict[int, Any]] = {
         name: cal_lines.numbers(
             getattr(args, name),
-            f"--{name.replace('_', '-')}",
+            option_of(name),
             positive=name.startswith("counts"),
         )
         for name in (

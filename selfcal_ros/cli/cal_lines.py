@@ -24,7 +24,7 @@ from selfcal_ros.applications.aerotech.export import (
 from selfcal_ros.applications.aerotech.header import SMALLEST, ArgumentFault, number
 from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, exit_code, say
+from selfcal_ros.cli.terminal import add_json, exit_code, option_of, say
 from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.compensation.plausible import (
@@ -205,7 +205,7 @@ def frame_of(
     for name in ("x_axis", "y_axis", "theta_axis"):
         if not 1 <= changes.get(name, 1) <= 32:
             raise InputError(
-                f"--{name.replace('_', '-')}",
+                option_of(name),
                 f"{changes[name]} is not in 1..32",
                 "indices in calibration files count from 1",
             )
@@ -241,7 +241,7 @@ def _counts(
     for name in ("home_theta_rad", "reverse_theta"):
         if name in changes and theta_axis is None:
             raise InputError(
-                f"--{name.removesuffix('_rad').replace('_', '-')}",
+                option_of(name.removesuffix("_rad")),
                 "there is no theta axis",
                 "name --theta-axis",
             )

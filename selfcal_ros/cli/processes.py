@@ -305,7 +305,7 @@ class Eyes:
 
 
 @contextlib.contextmanager
-def eyes(namespace: str, environment: dict | None = None) -> Iterator[Eyes]:
+def eyes(namespace: str) -> Iterator[Eyes]:
     """Yield a monitor process of the cell in `namespace`."""
     need_ros("")
     with process(
@@ -316,7 +316,7 @@ def eyes(namespace: str, environment: dict | None = None) -> Iterator[Eyes]:
             "--log-level",
             "error",
         ],
-        environment or dict(os.environ),
+        dict(os.environ),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

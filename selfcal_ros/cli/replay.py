@@ -30,6 +30,7 @@ from selfcal_ros.cli.terminal import (
     given,
     node_settings,
     on_stdout,
+    option_of,
     progress_bar,
     put,
     show,
@@ -212,7 +213,7 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
             offline(args, args.bag)  # raises what is missing
         for name in (name for name, value in options.items() if value is not None):
             raise InputError(
-                f"--{name.replace('_', '-')}",
+                option_of(name),
                 f"no images of {args.bag} are played",
                 "leave it out; it is for bags with images and no detections",
             )

@@ -22,7 +22,6 @@ SHADES = " .:-=+*#%@"
 LEVELS = {0: ("ok", "green"), 1: ("warn", "yellow"), 2: ("error", "red")}
 LEAST = (60, 18)
 """Columns and rows below which only the current task is shown."""
-SYMBOLS = {"um": "µm"}
 BETWEEN = 3
 """Columns between the two halves of the screen."""
 PREFIX = re.compile(r"^\[(\w+)\] \[[\d.]+\] \[([^\]]+)\]: ")
@@ -449,4 +448,4 @@ def _log_line(line: str) -> Text:
 
 
 def _with_unit(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g} {SYMBOLS.get(unit, unit)}"
+    return "-" if value is None else f"{value:.3g} {'µm' if unit == 'um' else unit}"

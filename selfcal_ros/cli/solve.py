@@ -22,6 +22,7 @@ from selfcal_ros.cli.terminal import (
     given,
     node_settings,
     on_stdout,
+    option_of,
     progress_bar,
     put,
     show,
@@ -173,7 +174,7 @@ def parameters(args: argparse.Namespace) -> tuple[CollectorSettings, SolverSetti
     for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":
             raise InputError(
-                f"--{option.replace('_', '-')}",
+                option_of(option),
                 "it belongs to a reference length, and none is given",
                 "name the length with --reference KIND:ERROR:U",
             )

@@ -49,7 +49,16 @@ from selfcal_ros.applications.laser.table import (
 from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, refuse_idle_force
-from selfcal_ros.cli.terminal import add_json, busy, put, save_drawing, say, tell, warn
+from selfcal_ros.cli.terminal import (
+    add_json,
+    busy,
+    option_of,
+    put,
+    save_drawing,
+    say,
+    tell,
+    warn,
+)
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_yaml, sha256_of
@@ -409,7 +418,7 @@ def refuse_given(
     """Refuse options that differ from their defaults, with the reason."""
     for name in names:
         if getattr(args, name) != args.leaf.get_default(name):
-            raise InputError(f"--{name.replace('_', '-')}", why, remedy)
+            raise InputError(option_of(name), why, remedy)
 
 
 def is_bag(path: str) -> bool:

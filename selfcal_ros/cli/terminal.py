@@ -134,10 +134,15 @@ def add_parameters(
             }
         )
         parser.add_argument(
-            f"--{option.replace('_', '-')}",
+            option_of(option),
             **how,
             help=f"{what}{unit}{semicolon}{more}{suffix}".replace("%", "%%"),
         )
+
+
+def option_of(name: str) -> str:
+    """Return the option of an argument by its name in Python."""
+    return f"--{name.replace('_', '-')}"
 
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
