@@ -161,21 +161,23 @@ class DetectionsSeen:
             late = self._late(self._lag(views), poses, session)
             session = replace(session, late=late)
         finding = diagnose(session)
-        named: dict[int | None, RejectionFinding] = {}
-        for index, readings in views.items():
-            of_view = diagnose(
-                self._evidence(
-                    readings.rejected,
-                    readings.used,
-                    {index: marks[index]} if index in marks else {},
-                    joints=joints and not faults,
-                    lies=faults.get(index, ""),
-                    late=session.late,
-                    view=index,
+        named: dict[int | None, RejectionFinding] = {
+            index: of_view
+            for index, readings in views.items()
+            if (
+                of_view := diagnose(
+                    self._evidence(
+                        readings.rejected,
+                        readings.used,
+                        {index: marks[index]} if index in marks else {},
+                        joints=joints and not faults,
+                        lies=faults.get(index, ""),
+                        late=session.late,
+                        view=index,
+                    )
                 )
             )
-            if of_view is not None:
-                named[index] = of_view
+        }
         if finding is None:
             return named
         all_alike = bool(session.lies or session.late) or (
@@ -240,23 +242,9 @@ class DetectionsSeen:
         ]
         if plate.marks is not None or not (outside or any(unread)):
             return None
-        named = (
-            (self.table["kind"] == Kind.GRID)
-            & self.table["has_id"]
-            & (self.view_of >= 0)
-        )
-        view_of = self.view_of[named]
-        seen_rows = [
-            _rows(self.table[axis][named], view_of, limits)
-            for axis, limits in zip("mn", plate.limits, strict=True)
-        ]
-        if len(np.unique(view_of)) < 2:  # rows that are missing may follow
-            seen_rows = [
-                rows | asked_rows
-                for rows, asked_rows in zip(seen_rows, rows_planned, strict=True)
-            ]
-        if not all(seen_rows) or any(
-            max(rows) - min(rows) + 1 != len(rows) for rows in seen_rows
+        seen_rows = self._seen_rows(rows_planned)
+        if not all(
+            rows and max(rows) - min(rows) + 1 == len(rows) for rows in seen_rows
         ):
             return None
         sides, planned = (tuple(map(len, rows)) for rows in (seen_rows, rows_planned))
@@ -276,6 +264,22 @@ class DetectionsSeen:
             f"the ids are those of {sides[0]} x {sides[1]} marks (m {m}, n {n}), not of "
             f"{nx} x {ny}{exchanged}; correct grid_size in the plan, or the ids",
         )
+
+    def _seen_rows(self, planned: Iterable[set[int]]) -> list[set[int]]:
+        """Return the rows of marks along m and n that the ids tell, gaps included."""
+        named = (
+            (self.table["kind"] == Kind.GRID)
+            & self.table["has_id"]
+            & (self.view_of >= 0)
+        )
+        view_of = self.view_of[named]
+        seen = [
+            _rows(self.table[axis][named], view_of, limits)
+            for axis, limits in zip("mn", self.artifact.limits, strict=True)
+        ]
+        if len(np.unique(view_of)) < 2:  # rows that are missing may follow
+            return [rows | asked for rows, asked in zip(seen, planned, strict=True)]
+        return seen
 
     def _evidence(
         self,

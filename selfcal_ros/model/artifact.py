@@ -103,8 +103,27 @@ class Artifact:
                 ("grid_pitch_m", self.marks.spacing_m),
             ):
                 object.__setattr__(self, name, value)
-        sides = ("grid_size", self.grid_size), ("grid_size_y", self.shape[1])
-        for name, size in () if self.marks else sides:
+        else:
+            self._check_sides()
+        self._check_pitch()
+        self._check_lines()
+        if self.map_grid is not None:
+            try:
+                Artifact(
+                    self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y
+                )
+            except InputError as error:
+                raise InputError(
+                    error.where.replace("artifact", "map"),
+                    error.what,
+                    "give the number of nodes a side, their pitch in m",
+                ) from error
+
+    def _check_sides(self) -> None:
+        for name, size in (
+            ("grid_size", self.grid_size),
+            ("grid_size_y", self.shape[1]),
+        ):
             if size > MAX_GRID_SIZE:
                 raise InputError(
                     f"artifact {name}",
@@ -118,6 +137,8 @@ class Artifact:
                     "give the number of rows; marks in fewer rows "
                     "as a list (artifact: {marks: FILE.csv})",
                 )
+
+    def _check_pitch(self) -> None:
         if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
             raise InputError(
                 "artifact grid_pitch",
@@ -132,6 +153,8 @@ class Artifact:
                 f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'µm'}? give the "
                 "distance between marks in metres",
             )
+
+    def _check_lines(self) -> None:
         if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:
             raise InputError(
                 "artifact angular_count",
@@ -147,17 +170,6 @@ class Artifact:
                 if most > 0
                 else "leave them out for a plate without lines",
             )
-        if self.map_grid is not None:
-            try:
-                Artifact(
-                    self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y
-                )
-            except InputError as error:
-                raise InputError(
-                    error.where.replace("artifact", "map"),
-                    error.what,
-                    "give the number of nodes a side, their pitch in m",
-                ) from error
 
     @cached_property
     def field(self) -> "Artifact":

@@ -127,22 +127,7 @@ def marks_of(
         )
     where_of_id: dict[int, str] = {}
     for number, x, y, place in zip(ids, x_m, y_m, where, strict=True):
-        if not -(2**31) <= number < 2**31:
-            raise InputError(
-                place, f"id {number} is not a 32 bit integer", "number the marks anew"
-            )
-        if not (isfinite(x) and isfinite(y)):
-            raise InputError(
-                place,
-                f"mark {number} has no place ({x:g}, {y:g})",
-                "give x and y in m, or delete the mark",
-            )
-        if max(abs(x), abs(y)) > MOST_M:
-            raise InputError(
-                place,
-                f"({x:g}, {y:g}) m of mark {number} is beyond every plate ({MOST_M:g} m)",
-                "is it in mm? give x and y in m",
-            )
+        _check_mark(number, x, y, place)
         if number in where_of_id:
             raise InputError(
                 place,
@@ -158,6 +143,25 @@ def marks_of(
     )
     _check_places(marks, where_of_list, where_of_id)
     return marks
+
+
+def _check_mark(number: int, x: float, y: float, where: str) -> None:
+    if not -(2**31) <= number < 2**31:
+        raise InputError(
+            where, f"id {number} is not a 32 bit integer", "number the marks anew"
+        )
+    if not (isfinite(x) and isfinite(y)):
+        raise InputError(
+            where,
+            f"mark {number} has no place ({x:g}, {y:g})",
+            "give x and y in m, or delete the mark",
+        )
+    if max(abs(x), abs(y)) > MOST_M:
+        raise InputError(
+            where,
+            f"({x:g}, {y:g}) m of mark {number} is beyond every plate ({MOST_M:g} m)",
+            "is it in mm? give x and y in m",
+        )
 
 
 def _check_places(

@@ -361,10 +361,12 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "measurement_sense": result.sense,
         "artifact": {
             **artifact_to_dict(artifact),
-            **{
-                key: plain(getattr(amap, key))
-                for key in ("magnification", "u_magnification")
-            },
+            **plain(
+                {
+                    key: getattr(amap, key)
+                    for key in ("magnification", "u_magnification")
+                }
+            ),
         },
         **({"map": map_fields} if (map_fields := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
@@ -383,28 +385,16 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "coverage_factor": plain(
             {kind: getattr(result.noise, f"k_{kind}") for kind in ("xy", "theta")}
         ),
-        "views": [
+        "views": list(map(_view_to_dict, result.views)),
+        "error_map": plain(
             {
-                "name": v.name,
-                "rotation": v.rotation,
-                "translation_x": v.translation_x,
-                "translation_y": v.translation_y,
-                "misalignment": {
-                    key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")
-                },
-                "used": v.used,
-                "rejected": v.rejected,
-                "read": {"grid": plain(v.read_grid), "angular": plain(v.read_angular)},
+                **{key: getattr(emap, key) for key in _MAP_ARRAYS},
+                "nonorthogonality": emap.nonorthogonality,
+                "scale_difference": emap.scale_difference,
+                "datum_theta": str(emap.datum_theta),
             }
-            for v in result.views
-        ],
-        "error_map": {
-            **{key: plain(getattr(emap, key)) for key in _MAP_ARRAYS},
-            "nonorthogonality": plain(emap.nonorthogonality),
-            "scale_difference": plain(emap.scale_difference),
-            "datum_theta": str(emap.datum_theta),
-        },
-        "artifact_map": {key: plain(getattr(amap, key)) for key in _PLATE_ARRAYS},
+        ),
+        "artifact_map": plain({key: getattr(amap, key) for key in _PLATE_ARRAYS}),
         "observability": _seen_to_dict(result.observability),
         "noise": plain(result.noise),
         "rejected": dict(result.rejected),
@@ -428,6 +418,19 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
+
+
+def _view_to_dict(v: ViewResult) -> dict[str, Any]:
+    return {
+        "name": v.name,
+        "rotation": v.rotation,
+        "translation_x": v.translation_x,
+        "translation_y": v.translation_y,
+        "misalignment": plain({key: getattr(v, key) for key in ("phi", "tx", "ty")}),
+        "used": v.used,
+        "rejected": v.rejected,
+        "read": plain({"grid": v.read_grid, "angular": v.read_angular}),
+    }
 
 
 def with_digests(data: dict[str, Any]) -> dict[str, Any]:
@@ -544,40 +547,14 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 
 
 def _parse(data: dict) -> CalibrationResult:
-    raw = data["artifact"]
-    grid = data.get("map", {})
-    harmonics = read(int, data.get("map", {}).get("harmonics", 0))
-    artifact = (
-        Artifact(
-            raw["grid_size"],
-            float(raw["grid_pitch"]),
-            raw["angular_count"],
-            raw.get("grid_size_y", 0),
-        )
-        if "marks" not in raw
-        else artifact_of(
-            {key: raw[key] for key in ("marks", "angular_count")}, "artifact"
-        )
-    )
-    artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=harmonics)
-    emap, amap = data["error_map"], data["artifact_map"]
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-        _MAP_ARRAYS[:4], artifact.field.shape
-    )
-    shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
-    error_map = ErrorMap(
-        artifact.field,
-        **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
-        nonorthogonality=read(float, emap["nonorthogonality"]),
-        scale_difference=read(float, emap["scale_difference"]),
-        datum_theta=ThetaDatum(emap["datum_theta"]),
-    )
+    artifact = _artifact(data["artifact"], data.get("map", {}))
+    error_map = _error_map(data["error_map"], artifact)
     observability = _seen_from_dict(read(dict, data["observability"]))
     camera, stage_yaw = shown_by_images(data.get("camera"))
     return CalibrationResult(
         read(str, data["plan_id"]),
         error_map,
-        _plate(amap, artifact, raw),
+        _plate(data["artifact_map"], artifact, data["artifact"]),
         views=tuple(map(_view, data["views"])),
         observability=observability,
         noise=read(Noise, data["noise"]),
@@ -605,6 +582,38 @@ def _parse(data: dict) -> CalibrationResult:
         verification=read(Verified | None, data.get(VERIFICATION)),
         camera=camera,
         stage_yaw=stage_yaw,
+    )
+
+
+def _artifact(raw: dict, grid: dict) -> Artifact:
+    """Return the plate with the nodes of the map."""
+    harmonics = read(int, grid.get("harmonics", 0))
+    artifact = (
+        Artifact(
+            raw["grid_size"],
+            float(raw["grid_pitch"]),
+            raw["angular_count"],
+            raw.get("grid_size_y", 0),
+        )
+        if "marks" not in raw
+        else artifact_of(
+            {key: raw[key] for key in ("marks", "angular_count")}, "artifact"
+        )
+    )
+    return replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=harmonics)
+
+
+def _error_map(emap: dict, artifact: Artifact) -> ErrorMap:
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        _MAP_ARRAYS[:4], artifact.field.shape
+    )
+    shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
+    return ErrorMap(
+        artifact.field,
+        **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
+        nonorthogonality=read(float, emap["nonorthogonality"]),
+        scale_difference=read(float, emap["scale_difference"]),
+        datum_theta=ThetaDatum(emap["datum_theta"]),
     )
 
 

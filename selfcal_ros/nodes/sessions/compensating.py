@@ -392,20 +392,10 @@ class CompensatingSession:
         by : tuple of callable
             Correction of (x, y) and of theta.
         """
-        place = {name: index for index, name in enumerate(names)}
-        if not len(positions) == len(names) == len(place):
+        stage = self._stage_joints(names, positions)
+        if stage is None or self.compensator is None:
             return None
-        x, y, theta = map(place.get, self._joints)
-        stage = [index for index in (x, y, theta) if index is not None]
-        if not stage:
-            self._since_status.strange_joints = tuple(names)
-        if not stage or (x is None) != (y is None):
-            return None
-        # nor NaN
-        if self.compensator is None or not all(
-            abs(positions[index]) <= FARTHEST for index in stage
-        ):
-            return None
+        x, y, theta = stage
         corrected = list(positions)
         try:
             if x is not None and y is not None:
@@ -419,11 +409,25 @@ class CompensatingSession:
                 corrected[theta] = float(corrections[1](positions[theta]))
         except InputError:
             return None
-        return (
-            corrected
-            if all(math.isfinite(corrected[index]) for index in stage)
-            else None
-        )
+        known = all(math.isfinite(corrected[i]) for i in stage if i is not None)
+        return corrected if known else None
+
+    def _stage_joints(
+        self, names: Sequence[str], positions: Sequence[float]
+    ) -> tuple[int | None, int | None, int | None] | None:
+        """Return the places of x, y and theta among the joints; None for no position of a stage."""
+        place = {name: index for index, name in enumerate(names)}
+        if not len(positions) == len(names) == len(place):
+            return None
+        x, y, theta = map(place.get, self._joints)
+        stage = [index for index in (x, y, theta) if index is not None]
+        if not stage:
+            self._since_status.strange_joints = tuple(names)
+        if not stage or (x is None) != (y is None):
+            return None
+        # nor NaN
+        is_position = all(abs(positions[index]) <= FARTHEST for index in stage)
+        return (x, y, theta) if is_position else None
 
     def answer(
         self,
