@@ -91,11 +91,7 @@ def run(args: argparse.Namespace) -> int:
     baseline = read_result(args.baseline) if args.baseline else None
     settings = BatchSettings(*parameters(args), args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
-    for bag in bags:
-        if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
-            raise InputError(
-                str(folder), f"it is in the bag {bag}", "name another folder"
-            )
+    _refuse_inside(folder, bags)
     with opened(folder):
         earlier_records = [] if args.redo else kept_records(folder, settings)
         record_of, places = done_and_to_do(earlier_records, bags)
@@ -128,6 +124,15 @@ def run(args: argparse.Namespace) -> int:
         content,
     )
     return exit_code(records)
+
+
+def _refuse_inside(folder: Path, bags: Sequence[Path]) -> None:
+    """Refuse a folder that is in a bag."""
+    for bag in bags:
+        if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
+            raise InputError(
+                str(folder), f"it is in the bag {bag}", "name another folder"
+            )
 
 
 def _worked(

@@ -15,7 +15,7 @@ from selfcal_ros.applications.aerotech.evaluate import (
     CalEvaluator,
     MachineSetup,
 )
-from selfcal_ros.applications.aerotech.model import Severity, Table1D, Table2D
+from selfcal_ros.applications.aerotech.model import CalFile, Severity, Table1D, Table2D
 from selfcal_ros.applications.aerotech.one_axis import OneAxisFit
 from selfcal_ros.applications.aerotech.read import (
     load_cal,
@@ -171,12 +171,7 @@ def add_files(group: argparse._SubParsersAction) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    if args.scanner_bits is not None and not args.gi4:
-        raise InputError("--scanner-bits", "it belongs to a GI4", "add --gi4")
-    bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
-    if not 6 <= bits <= 48:
-        raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
-    cal = read_cal(args.file, gi4=Gi4(bits) if args.gi4 else None)
+    cal = read_cal(args.file, gi4=_gi4(args))
     errors, warnings, tolerated = (len(cal.of(severity)) for severity in Severity)
     tables = [_described(table) for table in cal.tables]
     lines = [finding.text(args.file) for finding in cal.findings]
@@ -201,6 +196,22 @@ def _check(args: argparse.Namespace) -> int:
             "findings": findings,
         },
     )
+    _refuse_faults(args, cal)
+    return ExitCode.DONE
+
+
+def _gi4(args: argparse.Namespace) -> Gi4 | None:
+    """Return the scanner against whose restrictions a file is checked."""
+    if args.scanner_bits is not None and not args.gi4:
+        raise InputError("--scanner-bits", "it belongs to a GI4", "add --gi4")
+    bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
+    if not 6 <= bits <= 48:
+        raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
+    return Gi4(bits) if args.gi4 else None
+
+
+def _refuse_faults(args: argparse.Namespace, cal: CalFile) -> None:
+    """Refuse a file whose faults were told."""
     refuse_errors(cal)
     if args.gi4 and not any(isinstance(t, Table2D) and t.galvo for t in cal.tables):
         raise InputError(
@@ -209,7 +220,6 @@ def _check(args: argparse.Namespace) -> int:
     if args.strict and cal.findings:
         first = cal.findings[0]
         raise InputError(f"{args.file}:{first.line}", first.what, first.remedy)
-    return ExitCode.DONE
 
 
 def _described(table: Table1D | Table2D) -> dict:

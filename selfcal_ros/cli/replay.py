@@ -89,17 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start the nodes, play the bag, collect the result, stop the nodes."""
     need_ros(", or use `selfcal solve`")
-    if not args.fast and not args.rate > 0:
-        raise InputError(
-            "--rate", f"{args.rate:g} is not a speed", "give a number above 0"
-        )
-    if args.domain is not None and not 0 <= args.domain <= LARGEST_DOMAIN:
-        raise InputError(
-            "--domain",
-            f"{args.domain} is not a ROS domain",
-            f"give a number from 0 to {LARGEST_DOMAIN}",
-        )
-    check_outputs([args.bag, args.params], [file_of(args)])
+    _check(args)
     source = bag_input(args.bag)
     detector = detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
@@ -132,6 +122,21 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse options before anything is started."""
+    if not args.fast and not args.rate > 0:
+        raise InputError(
+            "--rate", f"{args.rate:g} is not a speed", "give a number above 0"
+        )
+    if args.domain is not None and not 0 <= args.domain <= LARGEST_DOMAIN:
+        raise InputError(
+            "--domain",
+            f"{args.domain} is not a ROS domain",
+            f"give a number from 0 to {LARGEST_DOMAIN}",
+        )
+    check_outputs([args.bag, args.params], [file_of(args)])
 
 
 def offline(args: argparse.Namespace, bag: str | Path) -> BagSession:

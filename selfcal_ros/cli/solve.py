@@ -265,12 +265,7 @@ def run(args: argparse.Namespace) -> int:
         with busy("solving"), named_bag(args.bag):
             result = calibrate_by(solver.method, measurements, options)
     except NotIdentifiableError as refused:
-        error = with_advice(refused)
-        if error.observability is not None:
-            result = unidentified_result(measurements, error.observability)
-            result = with_collected(result, measurements.views)
-            _write(args, _described(args, result, session.lost))
-        raise _first_fault(args.bag, error, session) from refused
+        raise _unidentified(args, measurements, session, refused) from refused
     if options.plate is not None:
         _require_other_recording(args.bag, options.plate, options.plate_from)
     with busy("validating"):
@@ -287,6 +282,21 @@ def run(args: argparse.Namespace) -> int:
     if lines:
         tell("\n".join(lines), aside(args))
     return exit_code(result)
+
+
+def _unidentified(
+    args: argparse.Namespace,
+    measurements: Measurements,
+    session: BagSession,
+    refused: NotIdentifiableError,
+) -> SelfcalError:
+    """Write what is known of a stage that the readings do not identify; return what to say."""
+    error = with_advice(refused)
+    if error.observability is not None:
+        result = unidentified_result(measurements, error.observability)
+        result = with_collected(result, measurements.views)
+        _write(args, _described(args, result, session.lost))
+    return _first_fault(args.bag, error, session)
 
 
 def collected(args: argparse.Namespace, settings: CollectorSettings) -> BagSession:
