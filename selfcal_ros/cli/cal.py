@@ -16,7 +16,7 @@ from selfcal_ros.applications.aerotech.evaluate import (
     MachineSetup,
 )
 from selfcal_ros.applications.aerotech.model import CalFile, Severity, Table1D, Table2D
-from selfcal_ros.applications.aerotech.one_axis import OneAxisFit
+from selfcal_ros.applications.aerotech.one_axis import OneAxisFit, OneAxisPart
 from selfcal_ros.applications.aerotech.read import (
     load_cal,
     load_cals,
@@ -369,19 +369,11 @@ def _export(args: argparse.Namespace) -> int:
         )
     }
     if frame.theta_axis is not None:
-        target = Path(args.output)
-        theta_path = args.theta_output or str(
-            target.with_name(f"{target.stem}_theta{target.suffix}")
-        )
-        if os.path.realpath(theta_path) == os.path.realpath(target):
-            raise InputError(
-                theta_path,
-                "a 1D and a 2D table cannot share a file",
-                "name another file",
-            )
-        table = export.table_theta(result.error_map, frame)
+        theta_path = _theta_path(args)
         texts[theta_path] = cal_text(
-            [table], comments=comments, decimals=export.theta_decimals(result.error_map)
+            [export.table_theta(result.error_map, frame)],
+            comments=comments,
+            decimals=export.theta_decimals(result.error_map),
         )
     lines, files = [], []
     tables = parse_cal(texts[args.output].encode(), args.output).tables
@@ -403,6 +395,19 @@ def _export(args: argparse.Namespace) -> int:
             f"--counts-per-unit {frame.theta_axis}=COUNTS makes it roll over",
         )
     return exit_code(result)
+
+
+def _theta_path(args: argparse.Namespace) -> str:
+    """Return the file of the theta table, which is not that of x and y."""
+    target = Path(args.output)
+    path = args.theta_output or str(
+        target.with_name(f"{target.stem}_theta{target.suffix}")
+    )
+    if os.path.realpath(path) == os.path.realpath(target):
+        raise InputError(
+            path, "a 1D and a 2D table cannot share a file", "name another file"
+        )
+    return path
 
 
 def numbered(steps: Sequence[str]) -> list[str]:
@@ -527,28 +532,38 @@ def _verify(args: argparse.Namespace) -> int:
             "the tables make the machine worse",
             "check signs, axes, unit, home position and encoder directions",
         )
-    for part in unfit_parts:
+    unfit = verification.unfit(result.error_map)
+    _warn_of_unfit(args, cal.where, unfit_parts, unfit)
+    return ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE
+
+
+def _warn_of_unfit(
+    args: argparse.Namespace,
+    where: str,
+    parts: Sequence[OneAxisPart],
+    residuals: Sequence[Residual],
+) -> None:
+    """Say what the tables leave that those of this map would not."""
+    for part in parts:
         warn(
             args,
-            f"{cal.where}: of {part.name}, which 1D tables can correct, the "
+            f"{where}: of {part.name}, which 1D tables can correct, the "
             f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
             f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
             "more than the U of the map: they are not those of this map; check sign, offset, "
             "unit and number of entries, or write them again",
         )
-    unfit = verification.unfit(result.error_map)
-    for residual in unfit:
+    for residual in residuals:
         rms_left, peak_left = (
             size("after") / size("before") for size in (residual.rms, residual.largest)
         )
         warn(
             args,
-            f"{cal.where}: the tables leave {100 * rms_left:.0f} % of the "
+            f"{where}: the tables leave {100 * rms_left:.0f} % of the "
             f"error at the {residual.place}, {100 * peak_left:.0f} % of the largest, more than the "
             "U of the map: they are not those of this map; check offset, unit and number of rows, "
             "or export them again",
         )
-    return ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE
 
 
 def one_axis_text(fit: OneAxisFit) -> str:

@@ -161,23 +161,21 @@ class DetectionsSeen:
             late = self._late(self._lag(views), poses, session)
             session = replace(session, late=late)
         finding = diagnose(session)
-        named: dict[int | None, RejectionFinding] = {
-            index: of_view
-            for index, readings in views.items()
-            if (
-                of_view := diagnose(
-                    self._evidence(
-                        readings.rejected,
-                        readings.used,
-                        {index: marks[index]} if index in marks else {},
-                        joints=joints and not faults,
-                        lies=faults.get(index, ""),
-                        late=session.late,
-                        view=index,
-                    )
+        named: dict[int | None, RejectionFinding] = {}
+        for index, readings in views.items():
+            of_view = diagnose(
+                self._evidence(
+                    readings.rejected,
+                    readings.used,
+                    {index: marks[index]} if index in marks else {},
+                    joints=joints and not faults,
+                    lies=faults.get(index, ""),
+                    late=session.late,
+                    view=index,
                 )
             )
-        }
+            if of_view is not None:
+                named[index] = of_view
         if finding is None:
             return named
         all_alike = bool(session.lies or session.late) or (

@@ -374,6 +374,26 @@ class Run:
             return
         if not resumed:
             self._visit(None)
+        progress = self._completed(view.name)
+        self.desk.show(progress)
+        cause = self._contradiction(progress)
+        if cause:
+            self.desk.say(f"note: view '{view.name}': {cause.what}; {cause.remedy}")
+        measurements, _ = self.collector.collect()
+        check_wiring(measurements)
+        if self._is_misplaced(measurements, view.name):
+            self._write_all(self._sequencer.redo())
+            return
+        self._write_all(self._sequencer.status(self.plan.plan_id, index, True))
+
+    def _completed(self, view: str) -> ViewProgress:
+        """Visit again what is missing of the view, until nothing is.
+
+        Raises
+        ------
+        NoDataError
+            If more rounds read no more.
+        """
         needed_before = math.inf
         rounds = 0
         progress = self._progress()
@@ -383,7 +403,7 @@ class Run:
             if rounds >= REVISITS:
                 why, remedy = self._why(progress)
                 raise NoDataError(
-                    f"view '{view.name}'",
+                    f"view '{view}'",
                     f"{_named(progress)} are not read after {rounds} more visits{why}",
                     remedy,
                 )
@@ -396,16 +416,7 @@ class Run:
                 )
             )
             progress = self._progress()
-        self.desk.show(progress)
-        cause = self._contradiction(progress)
-        if cause:
-            self.desk.say(f"note: view '{view.name}': {cause.what}; {cause.remedy}")
-        measurements, _ = self.collector.collect()
-        check_wiring(measurements)
-        if self._is_misplaced(measurements, view.name):
-            self._write_all(self._sequencer.redo())
-            return
-        self._write_all(self._sequencer.status(self.plan.plan_id, index, True))
+        return progress
 
     def _is_misplaced(self, measurements: Measurements, view: str) -> bool:
         """Return whether the plate lies otherwise than this view asks; a robot's error is raised.
