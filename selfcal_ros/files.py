@@ -10,6 +10,7 @@ import math
 import os
 import re
 import stat
+from collections.abc import Collection
 from dataclasses import MISSING, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
@@ -450,13 +451,7 @@ def checked_fields(
             where, "not a mapping of keys to values", "see the examples in config"
         )
     optional = optional or {}
-    for key in data:
-        if key not in required and key not in optional:
-            raise InputError(
-                f"{where}: {key}",
-                "unknown key",
-                known_are(str(key), [*required, *optional]),
-            )
+    refuse_unknown(data, [*required, *optional], where)
     out = {key: default for key, (_, default) in optional.items()}
     for key in required:
         if key not in data:
@@ -473,6 +468,15 @@ def checked_fields(
             )
         out[key] = value
     return out
+
+
+def refuse_unknown(data: dict, known_keys: Collection[str], where: str) -> None:
+    """Refuse a mapping with a key that is not known."""
+    for key in data:
+        if key not in known_keys:
+            raise InputError(
+                f"{where}: {key}", "unknown key", known_are(str(key), known_keys)
+            )
 
 
 _hints = cache(get_type_hints)

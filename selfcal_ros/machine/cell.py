@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from selfcal_ros.errors import InputError, first_line, known_are
-from selfcal_ros.files import read_text, read_yaml
+from selfcal_ros.files import read_text, read_yaml, refuse_unknown
 from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Machine, MachineError
 from selfcal_ros.model.readings import Sense
@@ -186,7 +186,7 @@ def read_cell(path: str | Path) -> Cell:
         "placing",
         "found",
     )
-    _only(data, known_keys, where)
+    refuse_unknown(data, known_keys, where)
     sense = Parameter(
         "sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense))
     )
@@ -268,7 +268,7 @@ def _limits(data: Any, where: str) -> dict[str, tuple[float, float]]:
         axis: _pair(pair, f"{where}: {axis}")
         for axis, pair in _mapping(data, where).items()
     }
-    _only(limits, AXES, where)
+    refuse_unknown(limits, AXES, where)
     for axis in AXES[:2]:
         if axis not in limits:
             raise InputError(
@@ -286,7 +286,7 @@ def _limits(data: Any, where: str) -> dict[str, tuple[float, float]]:
 def _placing(data: Any, where: str) -> tuple[str, str]:
     """Return who places the plate, and the command line of a robot, "" without one."""
     if isinstance(data, dict) and data:
-        _only(data, ("command",), f"{where}: placing")
+        refuse_unknown(data, ("command",), f"{where}: placing")
         command = Parameter("command", "", "")
         return "robot", command.check(data["command"], f"{where}: placing")
     placing = Parameter("placing", "person", "", choices=PLACERS)
@@ -300,7 +300,7 @@ def _detector(data: Any, where: str) -> DetectorSettings:
         for item in DetectorSettings.parameters()
         if item.name not in NOT_OF_A_CELL
     ]
-    _only(section, names, f"{where}: detector")
+    refuse_unknown(section, names, f"{where}: detector")
     return DetectorSettings.checked(section, f"{where}: detector")
 
 
@@ -312,19 +312,11 @@ def _mapping(data: Any, where: str) -> dict[str, Any]:
     return data
 
 
-def _only(data: Mapping[str, Any], known_keys: Any, where: str) -> None:
-    for key in data:
-        if key not in known_keys:
-            raise InputError(
-                f"{where}: {key}", "unknown key", known_are(str(key), known_keys)
-            )
-
-
 def _numbers(
     data: Any, where: str, defaults: Mapping[str, float], low: float | None = None
 ) -> dict[str, float]:
     section = _mapping(data, where)
-    _only(section, defaults, where)
+    refuse_unknown(section, defaults, where)
     return {
         name: Parameter(name, float(defaults[name]), "", low=low).check(value, where)
         for name, value in section.items()
@@ -453,7 +445,7 @@ def check_keys(kind: Any, cell: Cell) -> None:
     }
     takes_any = len(parameters) < len(inspect.signature(kind).parameters)
     if not takes_any:
-        _only(cell.keys, parameters, where)
+        refuse_unknown(cell.keys, parameters, where)
     missing = [
         name
         for name, item in parameters.items()

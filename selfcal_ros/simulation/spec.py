@@ -12,7 +12,7 @@ import numpy as np
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.files import read_yaml
+from selfcal_ros.files import read_yaml, refuse_unknown
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View
@@ -564,11 +564,7 @@ def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
 def _mapping(data: Any, where: str, known_keys: tuple[str, ...]) -> dict:
     if not isinstance(data, dict):
         raise InputError(where, "not a mapping", "see docs/guides/simulate.md")
-    for key in data:
-        if key not in known_keys:
-            raise InputError(
-                f"{where}: {key}", "unknown key", known_are(str(key), known_keys)
-            )
+    refuse_unknown(data, known_keys, where)
     return data
 
 
