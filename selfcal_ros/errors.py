@@ -6,7 +6,7 @@ The same codes are the ``error_code`` of services and actions.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from enum import IntEnum
 from typing import Any
@@ -101,6 +101,16 @@ def did_you_mean(word: str, known_names: Iterable[str]) -> str:
         if similar
         else ""
     )
+
+
+def some_of(words: Sequence[object], most: int, number: int = 0) -> str:
+    """Return the first words, and how many more there are.
+
+    `number` is how many there are if `words` are not all of them.
+    """
+    first = words[:most]
+    n_more = (number or len(words)) - len(first)
+    return ", ".join(map(str, first)) + (f" and {n_more} more" if n_more > 0 else "")
 
 
 def known_are(word: str, known_names: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console, Group, RenderableType
 from rich.text import Text
 
-from selfcal_ros.errors import printable
+from selfcal_ros.errors import printable, some_of
 
 _CONSOLE = Console(width=500, legacy_windows=False)
 """Used for the width of characters; nothing is printed on it."""
@@ -308,11 +308,7 @@ def _coverage(view: dict[str, Any], width: int) -> list[Text]:
     if noise != ["-", "-"]:
         texts.append(Text(f"repeatability {', '.join(noise)}"))
     if view["missing_lines"]:
-        missing = view["missing_lines"]
-        omission = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
-        texts.append(
-            Text(f"missing lines {', '.join(map(str, missing[:10]))}{omission}")
-        )
+        texts.append(Text(f"missing lines {some_of(view['missing_lines'], 10)}"))
     return texts
 
 

@@ -22,7 +22,7 @@ from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
-from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.errors import InputError, NoDataError, some_of
 from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, placing_error
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.machine.calling import called
@@ -568,5 +568,4 @@ def _named(progress: ViewProgress) -> str:
     names = [*marks, *(f"line {k}" for k in missing.k)]
     if not names:
         return "check stops"
-    omission = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + omission
+    return some_of(names, NAMED)

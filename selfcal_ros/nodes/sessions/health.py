@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import SelfcalError, first_line, printable
+from selfcal_ros.errors import SelfcalError, first_line, printable, some_of
 from selfcal_ros.estimation.checks.placing import misplaced, placing_error
 from selfcal_ros.estimation.checks.wiring import wiring_error, wiring_faults
 from selfcal_ros.model.readings import Measurements
@@ -421,11 +421,5 @@ def missing_marks(status: Any) -> str:
 
 
 def _named(words: list[str], count: int, what: str) -> str:
-    first_names = ", ".join(words[:NAMED])
-    n_unnamed = count - len(words[:NAMED])
     text = f"{count} {what}{'s' * (count != 1)}"
-    if not first_names:
-        return text
-    return f"{text}: {first_names}" + (
-        f" and {n_unnamed} more" if n_unnamed > 0 else ""
-    )
+    return f"{text}: {some_of(words, NAMED, count)}" if words else text

@@ -11,6 +11,7 @@ from functools import singledispatch
 from typing import Any
 
 from selfcal_ros.blocks import blocks
+from selfcal_ros.errors import some_of
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
 from selfcal_ros.model.budget import BudgetLine, OfAssumption, OfTerm
 from selfcal_ros.model.findings import (
@@ -529,21 +530,21 @@ def _(finding: Unchecked) -> str:
 def _counted(places: Sequence[Any], kind: str) -> str:
     if len(places) == 1:
         return f"1 {kind} {places[0]}"
-    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
-    return f"{len(places)} {kind}s ({', '.join(map(str, places[:NAMED]))}{more})"
+    return f"{len(places)} {kind}s ({some_of(places, NAMED)})"
 
 
 @sentence_of.register
 def _(finding: OutliersRemoved) -> str:
-    named = ", ".join(
+    named = [
         f"'{reading.view}' {reading.kind} "
         f"{reading.mark if len(reading.mark) > 1 else reading.mark[0]} "
         f"({reading.standardised:.1f} sigma)"
         for reading in finding.first
+    ]
+    return (
+        f"removed {counted(finding.number, 'outlier')}: "
+        f"{some_of(named, len(named), finding.number)}"
     )
-    n_more = finding.number - len(finding.first)
-    more = f" and {n_more} more" if n_more > 0 else ""
-    return f"removed {counted(finding.number, 'outlier')}: {named}{more}"
 
 
 @sentence_of.register
