@@ -6,7 +6,7 @@ import argparse
 import numpy as np
 
 from selfcal_ros.apply import StageMap, load
-from selfcal_ros.cli.deliver import deliver
+from selfcal_ros.cli.deliver import csv_text, deliver
 from selfcal_ros.cli.terminal import add_json, add_result, file_of, warn
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
@@ -232,7 +232,7 @@ def corrected(
         *(f"u_{name}" for name in names),
     ]
     return (
-        _csv(head, np.column_stack([points, *corrected_axes, *u])),
+        csv_text(head, np.column_stack([points, *corrected_axes, *u]).tolist()),
         unknown,
         int(outside.sum()),
     )
@@ -260,13 +260,8 @@ def distances(
         )
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
     unknown = int((np.isnan(error) & ~outside).sum())
-    return _csv([*ENDS, "length", "error", "u"], rows), unknown, int(outside.sum())
-
-
-def _csv(head: list[str], rows: np.ndarray) -> str:
-    """Return a table; what is not known is empty."""
-    lines = [
-        ",".join("" if cell != cell else repr(cell) for cell in row)
-        for row in rows.tolist()
-    ]
-    return "\n".join([",".join(head), *lines]) + "\n"
+    return (
+        csv_text([*ENDS, "length", "error", "u"], rows.tolist()),
+        unknown,
+        int(outside.sum()),
+    )

@@ -4,7 +4,7 @@
 import argparse
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from selfcal_ros.applications.aerotech.write import write_cals
@@ -51,6 +51,15 @@ def deliver(
         write_bytes(args.output, raw)
         say(args, f"written: {args.output}{note}", {"written": args.output, **data})
     return exit_code(result)
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Iterable[float | None]]) -> str:
+    """Return a table; what is not known is empty."""
+    lines = [
+        ",".join("" if cell is None or cell != cell else repr(cell) for cell in row)
+        for row in rows
+    ]
+    return "\n".join([",".join(head), *lines]) + "\n"
 
 
 def replace_files(

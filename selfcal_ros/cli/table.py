@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.cli.arguments import STDOUT
-from selfcal_ros.cli.deliver import deliver
+from selfcal_ros.cli.deliver import csv_text, deliver
 from selfcal_ros.cli.terminal import add_json, add_result, file_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
@@ -61,46 +61,30 @@ def run(args: argparse.Namespace) -> int:
         )
     check_outputs([args.result], [file_of(args)])
     result = read_result(args.result)
-    content = csv_bytes(result) if kind == ".csv" else npz_bytes(result)
+    content = csv_of(result) if kind == ".csv" else npz_bytes(result)
     return deliver(args, result, content, "csv", kind=kind.lstrip("."))
 
 
-def csv_bytes(result: CalibrationResult) -> bytes:
+def csv_of(result: CalibrationResult) -> str:
     """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
     emap, plate = result.error_map, result.artifact
-    rows = [",".join(COLUMNS)]
-    x_m = plate.x_m
-    y_m = plate.y_m
-    for i, j in ((i, j) for i in range(plate.shape[0]) for j in range(plate.shape[1])):
-        m, n = i - plate.middle[0], j - plate.middle[1]
-        cells = [
-            m,
-            n,
-            *(
-                float(part[i, j])
-                for part in (x_m, y_m, emap.gx, emap.gy, emap.u_gx, emap.u_gy)
-            ),
+    nx, ny = plate.shape
+    parts = plate.x_m, plate.y_m, emap.gx, emap.gy, emap.u_gx, emap.u_gy
+    rows: list[list[float | None]] = [
+        [
+            i - plate.middle[0],
+            j - plate.middle[1],
+            *(float(part[i, j]) for part in parts),
+            *[None] * 4,
         ]
-        rows.append(",".join([*map(_cell, cells), "", "", "", ""]))
+        for i in range(nx)
+        for j in range(ny)
+    ]
     for k in range(plate.angular_count):
-        cells = [
-            k,
-            2 * math.pi * k / plate.angular_count,
-            emap.g_theta[k],
-            emap.u_g_theta[k],
-        ]
-        rows.append("," * 8 + ",".join(map(_cell, cells)))
-    return ("\n".join(rows) + "\n").encode()
-
-
-def _cell(value: float) -> str:
-    return (
-        str(value)
-        if isinstance(value, int)
-        else ""
-        if value != value
-        else repr(float(value))
-    )
+        angle = 2 * math.pi * k / plate.angular_count
+        errors = float(emap.g_theta[k]), float(emap.u_g_theta[k])
+        rows.append([*[None] * 8, k, angle, *errors])
+    return csv_text(COLUMNS, rows)
 
 
 def npz_bytes(result: CalibrationResult) -> bytes:
