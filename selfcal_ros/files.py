@@ -10,7 +10,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
@@ -470,7 +470,9 @@ def checked_fields(
     return out
 
 
-def refuse_unknown(data: dict, known_keys: Collection[str], where: str) -> None:
+def refuse_unknown(
+    data: Iterable[Any], known_keys: Collection[str], where: str
+) -> None:
     """Refuse a mapping with a key that is not known."""
     for key in data:
         if key not in known_keys:
