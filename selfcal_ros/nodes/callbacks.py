@@ -8,6 +8,7 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.subscription import Subscription
@@ -63,10 +64,7 @@ class Numbered(WithInfo):
         # the events executor of rclpy 7.1 passes both as one pair
         message, info = received[0] if len(received) == 1 else received
         number = info["publication_sequence_number"]
-        is_only_one = (
-            self.subscription is not None
-            and self.subscription.get_publisher_count() == 1
-        )
+        is_only_one = self._count() == 1
         if is_only_one and self._last is not None and number > self._last + 1:
             self._lost(number - self._last - 1)
         # smaller: of another one, which may be gone
@@ -76,6 +74,13 @@ class Numbered(WithInfo):
             self._call(message, info)
         else:
             self._call(message)
+
+    def _count(self) -> int:
+        """Return the number of publishers; 0 of a subscription that begins or has ended."""
+        try:
+            return self.subscription.get_publisher_count() if self.subscription else 0
+        except InvalidHandle:
+            return 0
 
 
 class Guarded(Node):

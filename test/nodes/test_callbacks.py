@@ -9,6 +9,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.action import ActionClient, ActionServer
 from rclpy.action.server import ServerGoalHandle
+from rclpy.exceptions import InvalidHandle
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from selfcal_msgs.action import RunCalibration
@@ -158,6 +159,17 @@ def test_the_numbers_of_an_only_publisher_tell_what_is_missing(
         callback("message", {"publication_sequence_number": number})
     assert found == lost
     assert taken == ["message"] * len(numbers_and_publishers)
+
+
+def test_a_message_that_was_due_when_its_subscription_ended_is_taken():
+    def ended():
+        raise InvalidHandle("destruction was requested")
+
+    taken = []
+    callback = Numbered(taken.append, taken.append)
+    callback.subscription = SimpleNamespace(get_publisher_count=ended)
+    callback("message", {"publication_sequence_number": 7})
+    assert taken == ["message"]
 
 
 def test_what_a_recorder_did_not_receive_is_in_its_health(graph, tmp_path):

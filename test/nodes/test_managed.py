@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.duration import Duration
-from rclpy.event_handler import QoSSubscriptionEventType
 from rclpy.lifecycle import TransitionCallbackReturn
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -306,10 +305,7 @@ def test_no_event_of_a_stranger_is_due_when_a_subscription_ends(graph):
         if subscription.topic_name.removeprefix("/")
         in {topic.name for topic in names.INPUTS}
     ]
-    kinds = {handler.event_type for item in own for handler in item.event_handlers}
-    assert kinds == {
-        QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST,
-    }
+    assert len(own) > 1 and not any(item.event_handlers for item in own)
     outputs = {topic.name for topic in (names.STATUS, names.MEASUREMENT)}
     published = [
         publisher
