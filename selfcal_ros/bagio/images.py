@@ -46,6 +46,11 @@ COLUMNS = ("file", "view", "x", "y")
 plan the view is not needed."""
 TIME = "time"
 """Column for the times of the exposures, if they are known: ISO 8601 with its zone."""
+EARLIEST, LATEST = (
+    datetime(1970, 1, 2, tzinfo=UTC),
+    datetime(2038, 1, 18, tzinfo=UTC),
+)
+"""Times that a stamp can hold: seconds since 1970 in 32 bits, and commands are stamped earlier."""
 FARTHEST_M = 10.0
 FAR = 30
 """Median distance of positions, over that of the plate's edge, which shows another unit than m."""
@@ -146,6 +151,13 @@ def _stamp_ns(text: str, where: str) -> int:
     """Return a time as ns since 1970."""
     with suppress(ValueError):
         if (date := datetime.fromisoformat(text)).tzinfo is not None:
+            if not EARLIEST <= date <= LATEST:
+                raise InputError(
+                    where,
+                    f"'{text}' is not between {EARLIEST.date()} and {LATEST.date()}, "
+                    "as stamps of messages are",
+                    "correct the year, or the clock of the camera; or omit the column",
+                )
             return (
                 (date - datetime(1970, 1, 1, tzinfo=UTC))
                 // timedelta(microseconds=1)

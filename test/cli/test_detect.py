@@ -419,6 +419,14 @@ def own_values(data):
             "2026-11-21T09:30:00.25+0",
         ),
         (
+            "file,view,x,y,time\na.png,shift,0,0,1904-01-01T00:00:00Z\n",
+            ":2: '1904-01-01T00:00:00Z' is not between 1970-01-02 and 2038-01-18",
+        ),
+        (
+            "file,view,x,y,time\na.png,shift,0,0,2062-11-21T09:30:00Z\n",
+            ":2: '2062-11-21T09:30:00Z' is not between 1970-01-02 and 2038-01-18",
+        ),
+        (
             "file,view,x,y,time\na.png,shift,0,0,\n",
             ":2: an empty cell; give file, view, x, y, time",
         ),
