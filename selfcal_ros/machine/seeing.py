@@ -84,7 +84,7 @@ class Eye:
         if isinstance(image_or_offsets, Image):
             picture = self.trusted(image_or_offsets, position)
             return self._of_images().take_picture(
-                picture, image_or_offsets.stamp_ns or stamp_ns
+                picture, stamp_of(image_or_offsets, stamp_ns)
             )
         return [_detection(offset, stamp_ns) for offset in image_or_offsets]
 
@@ -168,25 +168,63 @@ def _kind_text(kind: tuple[object, ...]) -> str:
     return f"{width} x {height} {dtype}"
 
 
-def _detection(offset: Offset, stamp_ns: int) -> Detection:
-    if not np.isfinite([offset.x, offset.y, offset.theta or 0.0]).all():
+def stamp_of(seen: Image | Offset, called_ns: int) -> int:
+    """Return the stamp of an image or offset, ns; without one that of the call.
+
+    Raises
+    ------
+    MachineError
+        If it is not a number.
+    """
+    if not seen.stamp_ns:
+        return called_ns
+    try:
+        return int(seen.stamp_ns)  # time.time() * 1e9 is no whole number
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MachineError(
+            f"a stamp is {seen.stamp_ns!r:.50}",
+            "machine",
+            "give ns since 1970, or no stamp",
+        ) from error
+
+
+def _detection(offset: Offset, called_ns: int) -> Detection:
+    """Return an offset as a detection; raises MachineError for values of another kind."""
+    stamp_ns = stamp_of(offset, called_ns)
+    is_line = offset.theta is not None
+    try:
+        m, n = map(_whole, offset.mark or (0, 0))
+        detection = Detection(
+            stamp_ns=stamp_ns,
+            kind=int(Kind.ANGULAR if is_line else Kind.GRID),
+            has_id=(offset.line if is_line else offset.mark) is not None,
+            m=m,
+            n=n,
+            k=_whole(offset.line or 0),
+            offset_x=float(offset.x),
+            offset_y=float(offset.y),
+            offset_theta=float(offset.theta or 0.0),
+            sigma=float(offset.sigma),
+            score=float(offset.score),
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MachineError(
+            f"it returns {offset!r:.200}",
+            "machine.offsets",
+            "give m and rad, mark as two whole numbers (m, n), line as one",
+        ) from error
+    offsets = detection.offset_x, detection.offset_y, detection.offset_theta
+    if not np.isfinite(offsets).all():
         raise MachineError(
             f"an offset is x {offset.x}, y {offset.y}, theta {offset.theta}",
             "machine.offsets",
             "leave out what is not seen",
         )
-    m, n = offset.mark or (0, 0)
-    is_line = offset.theta is not None
-    return Detection(
-        stamp_ns=offset.stamp_ns or stamp_ns,
-        kind=int(Kind.ANGULAR if is_line else Kind.GRID),
-        has_id=(offset.line if is_line else offset.mark) is not None,
-        m=int(m),
-        n=int(n),
-        k=int(offset.line or 0),
-        offset_x=float(offset.x),
-        offset_y=float(offset.y),
-        offset_theta=float(offset.theta or 0.0),
-        sigma=float(offset.sigma),
-        score=float(offset.score),
-    )
+    return detection
+
+
+def _whole(number: float) -> int:
+    """Return a whole number; ValueError for another one, which would name another mark."""
+    if int(number) != number:
+        raise ValueError(number)
+    return int(number)

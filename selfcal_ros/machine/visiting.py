@@ -21,7 +21,7 @@ from selfcal_ros.machine.cell import FIRST_TURN_RAD, Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Image, Machine, MachineError, Offset
-from selfcal_ros.machine.seeing import Eye
+from selfcal_ros.machine.seeing import Eye, stamp_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -639,7 +639,7 @@ class Visitor:
         if isinstance(image_or_offsets, Image) and not self.detects:
             return [
                 Photo(
-                    image_or_offsets.stamp_ns or stamp_ns,
+                    stamp_of(image_or_offsets, stamp_ns),
                     np.asarray(image_or_offsets.pixels),
                 )
             ]

@@ -2,6 +2,7 @@
 """Faults of machines: each stops the stage or is named; what was measured is kept and continued."""
 
 import errno
+import math
 import re
 import sys
 import time
@@ -14,7 +15,7 @@ from selfcal_ros.bagio.journal import Journal
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.machine import MachineError, visiting
+from selfcal_ros.machine import MachineError, Offset, visiting
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.settings.nodes import CollectorSettings
 from test.machine.test_measuring import away_from, run_of
@@ -273,6 +274,11 @@ def test_lines_of_the_wrong_sense_are_refused_when_the_map_is_solved(tmp_path):
     [
         ("image", np.zeros((140, 150), np.uint8), "it returns ndarray; return Image"),
         ("offsets", None, "it returns None; return a list of Offset"),
+        ("offsets", [Offset(mark=(0.9999, 0))], r"it returns Offset\(.*0.9999, 0"),
+        ("offsets", [Offset(mark=1)], "mark as two whole numbers"),
+        ("offsets", [Offset(x="1 um")], r"it returns Offset\(x='1 um'"),
+        ("offsets", [Offset(stamp_ns="now")], "a stamp is 'now'; give ns since 1970"),
+        ("offsets", [Offset(stamp_ns=math.inf)], "a stamp is inf; give ns since 1970"),
     ],
 )
 def test_a_class_that_returns_something_else(tmp_path, name, value, said):
@@ -280,6 +286,28 @@ def test_a_class_that_returns_something_else(tmp_path, name, value, said):
     setattr(machine, name, lambda: value)
     with pytest.raises(MachineError, match=said):
         run_of(tmp_path, machine, cell).measure()
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_stamps_as_python_tells_the_time_in_seconds_are_ns_as_well(tmp_path, camera):
+    """time.time() * 1e9 is a float, and an image's was a traceback in the journal."""
+    cell, machine = write_cell(tmp_path, camera=camera)
+    run = run_of(tmp_path, machine, cell)
+    name = "image" if camera else "offsets"
+    seen = getattr(machine, name)
+
+    def stamped():
+        # a float has 256 ns there, so not at the begin of the call
+        run.clock.ns += 1000
+        stamp_ns = float(run.clock.ns)
+        run.clock.ns += 1000
+        if camera:
+            return replace(seen(), stamp_ns=stamp_ns)
+        return [replace(offset, stamp_ns=stamp_ns) for offset in seen()]
+
+    setattr(machine, name, stamped)
+    run.measure()
+    assert away_from(machine.truth, tmp_path / "bag")[1].verdict.qualified
 
 
 @pytest.mark.parametrize("name", ["move_to", "position", "offsets"])
