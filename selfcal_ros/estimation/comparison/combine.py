@@ -1052,14 +1052,14 @@ def _of_run(deviation: Deviation, kind: str, limit: float) -> dict[str, Any]:
 
 def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     """Return the verdict: enlarged if a run's U was, or if the runs differ by more than their U."""
-    enlarged: dict[tuple[str, str], Enlargement] = {}
+    enlarged: list[Enlargement] = []
     failed: list[Finding] = []
     for kind, mean in means.items():
         if mean.p_between < USUAL_LEVEL:
             u = np.sqrt(mean.between)
             name = BETWEEN + SUFFIX[kind]
             unit = KINDS[kind]
-            enlarged[name, unit] = Enlargement(name, rms(u), float(u.max()), unit)
+            enlarged.append(Enlargement(name, rms(u), float(u.max()), unit))
             failed.append(
                 BetweenRuns(
                     size=mean.u_between,
@@ -1069,12 +1069,7 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
                     quantity=kind,
                 )
             )
-    for member in members:
-        for item in member.result.verdict.enlarged_by if member.result else ():
-            before = enlarged.get((item.name, item.unit), item)
-            enlarged[item.name, item.unit] = max(
-                before, item, key=lambda one: one.u_rms
-            )
+        enlarged += _of_runs(members, kind, mean)
     of_runs = [
         member.name
         for member in members
@@ -1085,8 +1080,36 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     return Verdict(
         Grade.ENLARGED if failed else Grade.GOOD,
         tuple(failed),
-        enlarged_by=tuple(enlarged.values()),
+        enlarged_by=tuple(enlarged),
     )
+
+
+def _of_runs(members: Sequence[Member], kind: str, mean: Mean) -> list[Enlargement]:
+    """Return what enlarged U of runs, by its contribution to u of their mean.
+
+    What all runs share adds up by their weights; the rest, which differs between runs, by squares.
+    """
+    parts: dict[str, list[np.ndarray]] = {}
+    for member, weight in zip(members, mean.weights, strict=True):
+        for item in member.result.verdict.enlarged_by if member.result else ():
+            if item.unit == KINDS[kind]:
+                part = weight * np.array([item.u_rms, item.u_max])
+                parts.setdefault(item.name, []).append(part)
+    enlarged = []
+    for name, of_run in parts.items():
+        u_rms, u_max = (
+            np.sum(of_run, axis=0)
+            if _is_shared(name)
+            else np.sqrt(np.square(of_run).sum(axis=0))
+        )
+        enlarged.append(Enlargement(name, float(u_rms), float(u_max), KINDS[kind]))
+    return enlarged
+
+
+def _is_shared(name: str) -> bool:
+    """Return whether all runs of a machine have a cause of this name in common."""
+    block = blocks().get(name)
+    return block is not None and block.shared
 
 
 def _budget(

@@ -442,7 +442,25 @@ def test_what_enlarged_both_maps_of_a_run_is_named_of_both():
     of_lines = Enlargement("line_scale", 1e-6, 2e-6, "rad")
     verdict = Verdict(Grade.ENLARGED, enlarged_by=(of_map, of_lines))
     found = combine(thrice(replace(A, verdict=verdict))).result
-    assert found.verdict.enlarged_by == (of_map, of_lines)
+    for item, wanted in zip(found.verdict.enlarged_by, (of_map, of_lines), strict=True):
+        assert (item.name, item.unit) == (wanted.name, wanted.unit)
+        assert item.u_rms == pytest.approx(wanted.u_rms)
+        assert item.u_max == pytest.approx(wanted.u_max)
+
+
+def test_what_enlarged_runs_is_stated_as_it_enters_their_mean():
+    """By its weight; slips of runs are not one error. It was stated as in the worst run alone."""
+    slip = Enlargement("slip", 3e-8, 6e-8)
+    slipped = replace(A, verdict=Verdict(Grade.ENLARGED, enlarged_by=(slip,)))
+    one_of_three = [*thrice(slipped)[:1], *thrice(A)[1:]]
+    for runs, factor in (
+        (one_of_three, 1 / 3),
+        (thrice(slipped), 1 / np.sqrt(3)),
+    ):
+        (item,) = combine(runs).result.verdict.enlarged_by
+        assert item.name == "slip" and item.unit == "m"
+        assert item.u_rms == pytest.approx(factor * slip.u_rms)
+        assert item.u_max == pytest.approx(factor * slip.u_max)
 
 
 def test_a_reference_length_is_kept_once():
