@@ -495,7 +495,7 @@ class Run:
         self.desk.say(
             f"view '{view.name}': its marks lie {x * UM_PER_M:+.3g}, "
             f"{y * UM_PER_M:+.3g} µm from where they were: the plate was moved, or the "
-            "stage has another zero; the view is measured anew"
+            f"stage has another zero; the view is measured anew{_of_zero(progress)}"
         )
         return True
 
@@ -560,6 +560,16 @@ def place_by_robot(machine: Machine, cell: Cell, command: Command) -> None:
             f"{cell.path}: placing",
             "the plate is not placed; --resume continues",
         )
+
+
+def _of_zero(progress: ViewProgress) -> str:
+    """Return what another zero means for the views before, if there are any."""
+    if not progress.view_index:
+        return ""
+    return (
+        ". Another zero moves the map, and the views before have the former one: set it back, or "
+        "begin a new bag"
+    )
 
 
 def _named(progress: ViewProgress) -> str:

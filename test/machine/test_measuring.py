@@ -210,11 +210,13 @@ def test_a_view_interrupted_before_its_first_reading_is_placed_again(tmp_path):
     assert np.abs(away).max() < 5e-8
 
 
-def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
+@pytest.mark.parametrize("after", [18, 70])
+def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path, after):
+    """In the second view the first one has the former zero, which no reading shows."""
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
         run_of(
-            tmp_path, Spoilt(machine, "connection lost in a move", after=18), cell
+            tmp_path, Spoilt(machine, "connection lost in a move", after=after), cell
         ).measure()
 
     class Rehomed(Spoilt):
@@ -231,9 +233,10 @@ def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
     run_of(
         tmp_path, Rehomed(machine), cell, Jumping(Jumping().ns + 10**12), desk
     ).measure(resume=True)
-    assert any(
-        "its marks lie" in line and "measured anew" in line for line in desk.lines
-    )
+    [line] = [line for line in desk.lines if "its marks lie" in line]
+    assert "measured anew" in line
+    assert ("the views before have the former one" in line) == ("rot90" in line)
+    assert ("rot90" in line) == (after == 70)
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     assert readings.views[0].rejected.get("superseded_by_redo", 0) > 0 or (
         readings.rejected.get("superseded_by_redo", 0) > 0
