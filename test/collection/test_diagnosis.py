@@ -417,8 +417,8 @@ def test_stamps_that_are_late_from_the_middle_of_a_view_on():
     cell = scene(count=0, repeats=4, exposure_period_s=0.05)
     found = findings(stamped_late(cell, 0.1, first=40).events)
     assert (
-        f"58 of 100 detections were rejected as stage_not_at_mark: {REST}"
-        in found[None]
+        f"58 of 100 detections were rejected as stage_not_at_mark: {REST} 0.1 s before their "
+        "detections are stamped; stamp" in found[None]
     )
 
 
