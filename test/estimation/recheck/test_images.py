@@ -11,11 +11,15 @@ from scipy.stats import binom
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import together
-from selfcal_ros.estimation.joint.slow_motion import slow_correlation
+from selfcal_ros.estimation.joint.slow_motion import MotionOfStops, slow_correlation
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
-from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
+from selfcal_ros.estimation.recheck.solve import (
+    StopsOfImages,
+    predict_recheck,
+    recheck,
+)
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.kept import SlowKept
 from selfcal_ros.model.readings import Sense
@@ -323,6 +327,14 @@ def test_exposures_of_one_visit_do_not_show_how_large_slow_motion_is():
     first, result = slow_session(4, 1, within_m=MARK)
     assert not result.recheck.changed
     assert result.noise.sigma_xy == pytest.approx(first.noise.sigma_xy, rel=0.1)
+
+
+@pytest.mark.parametrize(("motion_m", "dof"), [(1e-11, 60), (1e-5, 15)])
+def test_four_marks_of_an_image_that_move_together_are_as_one(motion_m, dof):
+    """White motion: repeats that show nothing else have a quarter of the degrees of freedom."""
+    white = MotionOfStops(np.eye(1), 1.0, 1.0)
+    images = StopsOfImages(np.zeros((1, 2, 2), dtype=int), MARK**2, motion_m**2, white)
+    assert images.repeats(MARK, 60) == pytest.approx((MARK, dof), rel=1e-3)
 
 
 def test_identical_exposures_average_nothing():

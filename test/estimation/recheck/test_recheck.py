@@ -18,8 +18,17 @@ from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.problem import noise_estimate
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.recheck.plate import known_plate
-from selfcal_ros.estimation.recheck.solve import _misfit, predict_recheck, recheck
-from selfcal_ros.estimation.recheck.views import Effects, map_of_lines
+from selfcal_ros.estimation.recheck.solve import (
+    _misfit,
+    predict_recheck,
+    recheck,
+    recheck_of,
+)
+from selfcal_ros.estimation.recheck.views import (
+    Effects,
+    dof_of_residuals,
+    map_of_lines,
+)
 from selfcal_ros.estimation.terms.columns import LineColumns
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.artifact import Artifact
@@ -261,6 +270,41 @@ def calibrated():
     return saved(calibrate(sessions()[0], linear()))
 
 
+def two_views_again(seed, sigma):
+    """Return a calibration on the lattice, and two views of the same stage and plate."""
+    plan, again = (plan_of(views, Artifact(5, PITCH)) for views in ("0,90,tx", "0,90"))
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=1e-5))
+    of_views = {
+        name: getattr(truth, name)[:2] for name in ("t_m", "phi_rad", "plate_shape_m")
+    }
+    settings = CellSettings(sigma_xy_m=sigma, **QUIET)
+    return tuple(
+        simulate_measurements(one, its, rng, visits=True, settings=settings)
+        for one, its in ((truth, plan), (replace(truth, **of_views), again))
+    )
+
+
+@pytest.mark.parametrize(
+    "sessions_of",
+    [
+        two_views_again,
+        lambda seed, sigma: general((4, (0.1, -0.1)), sigma, seed, nodes=3),
+    ],
+    ids=["on the lattice", "a map of few nodes"],
+)
+def test_residuals_of_noise_have_the_square_of_their_degrees_of_freedom(sessions_of):
+    """As many as there are readings less the nodes and misalignments that they determine."""
+    ratios = []
+    for seed in range(5):
+        before, after = sessions_of(seed, 20e-9)
+        plate = known_plate(calibrate(before, linear()), "r.json")
+        found = recheck_of(after, linear(), plate)
+        square = found.square * (found.xy.sigma / 20e-9) ** 2
+        ratios.append(square / dof_of_residuals(found.problem))
+    assert np.mean(ratios) == pytest.approx(1, abs=0.2)
+
+
 def test_terms_with_sizes_are_part_of_the_noise():
     """Strain of the plate in this view is not to be told from the map's own first-order terms."""
     _, after = sessions()
@@ -306,6 +350,7 @@ def test_the_noise_is_that_of_many_or_larger_repeats_or_of_the_calibration():
     view, before = after.views[0], plate.result.noise.sigma_xy
     for dof, shown, sigma in (
         (29, 2e-8, before),
+        (29, 1.25 * before, before),  # as one of ten would be
         (29, 5e-8, 5e-8),
         (30, 2e-8, 2e-8),
     ):
