@@ -8,9 +8,13 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
-from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.terms.columns import Column
-from selfcal_ros.estimation.verdict.causes import _groups, find_explanations
+from selfcal_ros.estimation.verdict.causes import (
+    _groups,
+    find_explanations,
+    scatter_of_views,
+)
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.findings import ApproachUnknown, VisitedOnce
 from selfcal_ros.model.terms import parse_terms
@@ -178,25 +182,57 @@ def test_clean_machines_are_qualified_and_name_no_cause():
     assert good.sentence == "Good: residuals and the noise of readings agree"
 
 
-def test_a_noisy_view_is_named():
-    def louder(readings):
-        views = list(readings.views)
-        views[3] = replace(views[3], sigma_xy=3 * views[3].sigma_xy, visits=None)
-        return replace(readings, views=tuple(views))
+def louder(readings, by, *, visits):
+    """Let the repeats of view 3 scatter more, by a factor, with their visits or without."""
+    views = list(readings.views)
+    view, seen = views[3], views[3].visits
+    number = np.bincount(seen.mark)
+    means = [np.bincount(seen.mark, of) / number for of in (seen.dx, seen.dy)]
+    dx, dy = (
+        mean[seen.mark] + by * (of - mean[seen.mark])
+        for mean, of in zip(means, (seen.dx, seen.dy), strict=True)
+    )
+    seen = replace(seen, dx=dx, dy=dy) if visits else None
+    views[3] = replace(view, sigma_xy=by * view.sigma_xy, visits=seen)
+    return replace(readings, views=tuple(views))
 
-    truth, result = calibrated(spoil=louder)
+
+@pytest.mark.parametrize("visits", [False, True])
+def test_a_noisy_view_is_named(visits):
+    loud = []
+
+    def spoil(readings):
+        spoilt = louder(readings, 3, visits=visits)
+        loud.append(spoilt.views[3].sigma_xy)
+        return spoilt
+
+    truth, result = calibrated(spoil=spoil)
     verdict = result.verdict
     names = [cause.name for cause in verdict.causes]
     assert "noise" in names and verdict.grade is Grade.ENLARGED
     assert covered(result, truth.g) >= 0.85
     # nobody knows which nodes rest on the view: u is as for its noise everywhere
-    wider = result.error_map.u_gx / judged().error_map.u_gx
-    assert wider == pytest.approx(
-        3 * SETTINGS.sigma_xy_m / result.noise.sigma_xy, rel=0.1
-    )
+    clean = judged()
+    wider = result.error_map.u_gx / clean.error_map.u_gx
+    assert wider == pytest.approx(loud[0] / clean.noise.sigma_xy, rel=1e-3)
     cause = verdict.causes[names.index("noise")]
     assert " times as much noise in view '-x' as in" in cause.text
     assert cause.view == "-x" and cause.size == pytest.approx(3, rel=0.1)
+
+
+def test_the_noise_of_a_view_is_that_of_its_visits_less_what_terms_explain():
+    """Visits from either side differ by up to 100 nm, with a noise of 20 nm."""
+    plan, rng = plan_of(), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, 6, rng, CASES["backlash"][3]["spread"])
+    readings = simulate_measurements(truth, plan, rng, settings=SETTINGS, visits=True)
+    options = replace(OPTIONS, terms=parse_terms(["approach"], ""))
+    views = scatter_of_views(readings, fit_joint(readings, options))
+    seen = {view.view.name: view.visits for view in readings.views if view.visits}
+    assert seen.keys() == {name for name, *_ in views}
+    for name, sigma, dof in views:
+        mark = seen[name].mark
+        assert dof == 2 * (len(mark) - len(np.unique(mark)))
+        assert sigma == pytest.approx(SETTINGS.sigma_xy_m, rel=0.2)
 
 
 def test_an_effect_without_consequence_disqualifies_nothing():
