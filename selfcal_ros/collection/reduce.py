@@ -426,8 +426,7 @@ def _identified_at(
     assignment.reasons[number < 0] = Reason.OUTSIDE_IMAGE
     if view.image is None:
         assignment.reasons[_beside_a_nearer(d, assignment)] = Reason.SEVERAL
-    astray = assignment.reasons == Reason.NOT_AT_MARK
-    if astray.any():
+        astray = assignment.reasons == Reason.NOT_AT_MARK
         astray &= np.isin(d["stamp"], d["stamp"][assignment.reasons == None])  # noqa: E711
         assignment.reasons[astray] = Reason.SEVERAL
     return assignment, number

@@ -194,6 +194,19 @@ def test_without_an_image_in_the_plan_other_marks_are_named():
     }
 
 
+def test_a_wrong_id_in_an_image_is_not_called_one_mark_too_many():
+    """The plan states how many marks an image shows: to state it was no advice."""
+    shot = scene(image_plan(7), with_ids=True, **QUIET)
+    wrong = [
+        replace(d, m=-d.m, n=-d.n) if number % 9 == 0 and abs(d.m) > 2 else d
+        for number, d in enumerate(shot.detections)
+    ]
+    measurements, _ = collect([*shot.commands, *shot.samples, *wrong])
+    rejected = measurements.all_rejected()
+    assert rejected[str(Reason.NOT_AT_MARK)] > 5
+    assert str(Reason.SEVERAL) not in rejected
+
+
 def test_progress_counts_the_marks_of_images_and_names_the_stops_to_repeat():
     shot = scene(image_plan(7, turns=(90,)))
     _, progress = collect(shot.events)
