@@ -468,10 +468,7 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
 
     tell("of three views")
     player = SimpleNamespace(
-        listener="",
-        unheard=list,
-        detector="",
-        unseen=list,
+        deaf=list,
         done=True,
         step=lambda: None,
         played=1,
@@ -521,10 +518,7 @@ def test_a_session_plays_nothing_where_somebody_else_publishes(
 
 def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
     player = SimpleNamespace(
-        listener="",
-        unheard=list,
-        detector="",
-        unseen=list,
+        deaf=list,
         done=True,
         step=lambda: None,
         played=5,
@@ -554,12 +548,9 @@ def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
 
 
 def test_nothing_is_played_before_the_nodes_listen(graph):
-    deaf, steps, turns = ["encoder"], [], []
+    deaf, steps, turns = ["a node does not listen to encoder"], [], []
     player = SimpleNamespace(
-        listener="/measurement_collector",
-        unheard=lambda: turns.append(1) or deaf,
-        detector="",
-        unseen=list,
+        deaf=lambda: turns.append(1) or deaf,
         done=True,
         step=lambda: steps.append(1),
         played=5,
