@@ -120,6 +120,7 @@ import signal
 import subprocess
 from pathlib import Path
 
+from selfcal_ros.machine.simulated import SimulatedMachine
 
 
 class LeftAlone(SimulatedMachine):
