@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.terminal import (
@@ -19,7 +20,6 @@ from selfcal_ros.cli.terminal import (
     say,
     warn,
 )
-from selfcal_ros.collection.inputs import Command
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import creating, write_bytes
@@ -27,6 +27,7 @@ from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.settings.parameter import TYPED
+from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.vision.detector import Judged
 from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector
@@ -138,9 +139,15 @@ def _require_plates(args: argparse.Namespace, settings: DetectorSettings) -> Non
     """Refuse markers of another plate than that of a command in the bag."""
     space = args.namespace
     bag = BagReader(Path(args.bag), None if space is None else space.strip("/"))
-    for _, item in bag.columns():
-        if isinstance(item, Command) and item.artifact is not None:
-            settings.require_plate(item.artifact, args.params or TYPED)
+    for role, item in bag.columns():
+        if role != COMMAND_TOPIC:
+            continue
+        try:
+            plate = to_model.command(item).artifact
+        except InputError:  # as of a stranger: the collector refuses it with its reason
+            continue
+        if plate is not None:
+            settings.require_plate(plate, args.params or TYPED)
 
 
 def _empty(name: str) -> Path:
@@ -183,21 +190,21 @@ def text_of(output: str, counts: dict[str, int]) -> str:
         if name.startswith("rejected_")
     )
     extra_counts = [
-        f"{counts[name]} {text}"
+        f"{counted(counts[name], 'image')} {text}"
         for name, text in (
-            ("images_without_marks", "images without marks"),
+            ("images_without_marks", "without marks"),
             (
                 "images_with_contradicting_markers",
-                "images without ids: their markers do not lie as on this plate",
+                "without ids: markers do not lie as on this plate",
             ),
-            ("images_refused", "images refused"),
+            ("images_refused", "refused"),
             (
                 "images_repeated",
-                "images that are the one before them under another stamp: no repeats",
+                "shown before, under another stamp: no repeats",
             ),
             (
                 "images_with_more_pages",
-                "images with further pages, which were not used",
+                "with further pages, which were not used",
             ),
         )
         if counts.get(name)

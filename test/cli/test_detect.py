@@ -197,7 +197,7 @@ def test_bad_images_give_one_line_each_and_lose_nothing_else(bag, tmp_path, caps
     assert detect(tmp_path / "bad", tmp_path / "found") == 0
     printed = capsys.readouterr()
     assert printed.out.strip().endswith(
-        "14 marks in 15 images; 1 images without marks; 4 images refused"
+        "14 marks in 15 images; 1 image without marks; 4 images refused"
     )
     lines = printed.err.splitlines()
     assert len(lines) == 5

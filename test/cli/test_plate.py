@@ -19,6 +19,7 @@ from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
+from test.support.sources import ROOT
 
 PLAN = """plan_id: tiny
 artifact: {grid_size: 3, grid_pitch: 1.0e-3, angular_count: 0}
@@ -199,7 +200,7 @@ def test_markers_that_do_not_lie_as_on_the_plate_name_no_mark_and_are_counted(
     assert text_of("bag", counts).startswith(
         f"bag: {counts['marks']} marks in 1 image, 0 with their ids"
     )
-    assert "1 images without ids" in text_of("bag", counts)
+    assert "1 image without ids" in text_of("bag", counts)
 
 
 def test_a_camera_knows_which_marks_it_sees(coded_svg):
@@ -229,6 +230,16 @@ def test_markers_are_those_of_the_plate_of_the_plan(artifact, said):
         return settings.require_plate(artifact, "test")
     with pytest.raises(InputError, match=said):
         settings.require_plate(artifact, "test")
+
+
+def test_markers_are_those_of_the_plate_in_the_commands_of_a_bag(tmp_path, capsys):
+    command = ["detect", str(ROOT / "bags/camera"), "-o", str(tmp_path / "out")]
+    options = ["--pixel-size", "6e-6", "--mark-size", "72e-6", "--aruco", "4x6"]
+    assert main([*command, *options]) == 2
+    assert (
+        "aruco: '4x6', but the plate of the plan has 5 x 5" in capsys.readouterr().err
+    )
+    assert not (tmp_path / "out").exists()
 
 
 def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):

@@ -69,6 +69,13 @@ class DetectingSession:
             return Diagnosis(
                 Level.WARN, f"no mark in the last {self._empty} images{why}", values
             )
+        if 2 * counts.contradicting > counts.images:
+            return Diagnosis(
+                Level.WARN,
+                f"the markers of {counts.contradicting} of {counted(counts.images, 'image')} do "
+                "not lie as on the plate that 'aruco' names: their marks have no ids",
+                values,
+            )
         if counts.come_twice:
             return Diagnosis(
                 Level.ERROR,
