@@ -6,6 +6,7 @@ common to all runs of one machine (covariance K; s_i = 1, or 0 for a run of othe
 the part between runs. Its covariance T has one variance for each given shape, and one for the rest.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -1087,21 +1088,25 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
 def _of_runs(members: Sequence[Member], kind: str, mean: Mean) -> list[Enlargement]:
     """Return what enlarged U of runs, by its contribution to u of their mean.
 
-    What all runs share adds up by their weights; the rest, which differs between runs, by squares.
+    What all runs share, and all of rechecks but their noise, adds up by their weights; the rest,
+    which differs between runs, by squares.
     """
-    parts: dict[str, list[np.ndarray]] = {}
+    # of each cause what is shared, and the squares of the rest; rms and largest
+    sums: dict[str, np.ndarray] = defaultdict(lambda: np.zeros((2, 2)))
     for member, weight in zip(members, mean.weights, strict=True):
-        for item in member.result.verdict.enlarged_by if member.result else ():
-            if item.unit == KINDS[kind]:
-                part = weight * np.array([item.u_rms, item.u_max])
-                parts.setdefault(item.name, []).append(part)
+        if member.result is None:
+            continue
+        for item in member.result.verdict.enlarged_by:
+            if item.unit != KINDS[kind]:
+                continue
+            part = weight * np.array([item.u_rms, item.u_max])
+            if member.result.recheck is not None or _is_shared(item.name):
+                sums[item.name][0] += part
+            else:
+                sums[item.name][1] += part**2
     enlarged = []
-    for name, of_run in parts.items():
-        u_rms, u_max = (
-            np.sum(of_run, axis=0)
-            if _is_shared(name)
-            else np.sqrt(np.square(of_run).sum(axis=0))
-        )
+    for name, (shared, squares) in sums.items():
+        u_rms, u_max = np.sqrt(shared**2 + squares)
         enlarged.append(Enlargement(name, float(u_rms), float(u_max), KINDS[kind]))
     return enlarged
 

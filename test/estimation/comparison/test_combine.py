@@ -463,6 +463,22 @@ def test_what_enlarged_runs_is_stated_as_it_enters_their_mean():
         assert item.u_max == pytest.approx(factor * slip.u_max)
 
 
+def test_what_enlarged_rechecks_is_stated_in_full():
+    """All but their noise enters their mean as it is: the plate they are known from is one."""
+    slip = Enlargement("slip", 3e-8, 6e-8)
+    verdict = Verdict(Grade.ENLARGED, enlarged_by=(slip,))
+    plates = [
+        SimpleNamespace(calibration=SimpleNamespace(readings={"sha256": plate}))
+        for plate in ("first", "second")
+    ]
+    rechecks = [
+        part(name, replace(result, verdict=verdict, recheck=plate))
+        for name, result, plate in zip("ab", (A, B), plates, strict=True)
+    ]
+    (item,) = combine(rechecks).result.verdict.enlarged_by
+    assert item.u_rms == pytest.approx(slip.u_rms)
+
+
 def test_a_reference_length_is_kept_once():
     reference = Options(
         assumed=(),
