@@ -57,6 +57,7 @@ class Numbered(WithInfo):
         super().__init__(call)
         self._lost = lost
         self._last: int | None = None
+        self._publishers = 0  # at the last message: one that ended since is counted
         self.subscription: Subscription | None = None
 
     def __call__(self, *received: Any) -> None:
@@ -64,7 +65,9 @@ class Numbered(WithInfo):
         # the events executor of rclpy 7.1 passes both as one pair
         message, info = received[0] if len(received) == 1 else received
         number = info["publication_sequence_number"]
-        is_only_one = self._count() == 1
+        publishers = self._count()
+        is_only_one = max(publishers, self._publishers) == 1
+        self._publishers = publishers
         if is_only_one and self._last is not None and number > self._last + 1:
             self._lost(number - self._last - 1)
         # smaller: of another one, which may be gone

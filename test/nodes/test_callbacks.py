@@ -144,6 +144,7 @@ def test_spin_goes_on_after_an_error(ros_environment):
         pytest.param([(7, 1), (1, 1), (2, 1), (5, 1)], [2], id="started anew"),
         pytest.param([(7, 1), (1, 2), (9, 2), (12, 1)], [], id="two at once"),
         pytest.param([(7, 1), (1, 1), (8, 1), (9, 1)], [], id="one that came and went"),
+        pytest.param([(7, 1), (8, 1), (20, 0)], [11], id="one that has ended"),
         pytest.param([(None, 1), (None, 1)], [], id="middleware without numbers"),
     ],
 )
