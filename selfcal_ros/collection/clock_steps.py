@@ -55,7 +55,7 @@ class StepWatch:
     delayed messages were lost, stamps get closer to their reception again, but no closer
     than before. Messages that are sent again at once are no step either, nor images of which some
     take a detector longer. If the clock of reception steps as well, only a step back can be
-    distinguished from a pause. A step is seen 15 messages, or five images, later.
+    distinguished from a pause. A step is seen 15 messages, or six images, later.
 
     Parameters
     ----------
@@ -160,12 +160,9 @@ class StepWatch:
             # by at least half of it: the rest may be a delay that ended
             ahead = offset[number] - nearest > max(self._limit_ns, size[number]) // 2
             if size[number] < 0 or (size[number] and ahead):
-                # of the groups affected, the middle one contains the step
-                last = min(number + BESIDE, count)
-                best = number + int(np.abs(size[number:last]).argmax())
-                out.append(ClockStep(int(before[1][1, best]), int(size[best])))
+                out.append(ClockStep(int(before[1][1, number]), int(size[number])))
                 self._quiet = 2 * BESIDE
-                self._nearest = nearest + int(size[best]), when
+                self._nearest = nearest + int(size[number]), when
         return out
 
     def _nearest_so_far(self, before: np.ndarray) -> tuple[int, int]:
@@ -211,7 +208,9 @@ def _parted(
     goes_back = np.maximum(
         np.maximum(high[1], between[1]) - next_low[1], high[1] - between[0]
     )
-    back = clear & (by < 0) & (goes_back > limit_ns // 2) & ~sent_again
+    # one late message among others is not enough
+    again_there = (goes_back > limit_ns // 2) & (next_low[1] <= high[1])
+    back = clear & (by < 0) & again_there & ~sent_again
     # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
     together = (
