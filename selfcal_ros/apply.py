@@ -333,9 +333,9 @@ class StageMap(Compensator):
         return float(solution.x[0] * size), float(solution.x[1] * size / length.max())
 
     def _places(self, *, between: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y of at most about `MOST_NODES` known nodes along a side, m, (P,).
+        """Return x and y of known nodes, m, (P,); with `between` of points halfway as well.
 
-        With `between`, also of points halfway between them whose neighbours are known.
+        At most about `MOST_NODES` along a side, which of a larger field stand for the others.
         """
         plate = self.error_map.artifact
         if not between:

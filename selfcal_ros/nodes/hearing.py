@@ -68,9 +68,10 @@ def publishers_of(node: Node, topic: str) -> Sequence[TopicEndpointInfo]:
     return node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
 
 
-def others_on(node: Node, topic: str, own_nodes: Iterable[str]) -> Iterable[str]:
+def others_on(node: Node, topic: str, own_nodes: Iterable[str]) -> list[str]:
     """Return the nodes that publish on a topic beside `own_nodes`, each of which may once."""
-    return Counter(map(node_of, publishers_of(node, topic))) - Counter(own_nodes)
+    found = Counter(map(node_of, publishers_of(node, topic)))
+    return [*(found - Counter(own_nodes))]
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str:
