@@ -40,6 +40,7 @@ def stepped(at, by_ns):
 def test_a_step_is_found_with_its_amount_and_place(at, by_ns, pieces):
     delay = np.random.default_rng(at).exponential(10 * MS, len(TRUE)).astype(int)
     (step,) = found(stepped(at, by_ns), TRUE + delay, pieces=pieces)
+    assert [step] == found(stepped(at, by_ns), TRUE + delay)
     assert abs(step.by_ns - by_ns) < 30 * MS
     assert 0 < TRUE[at] - step.before_ns <= 11 * 5 * MS
 
