@@ -80,10 +80,12 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
+        if not len(stamps_ns):
+            return []
         new = np.stack([stamps_ns, received_ns, self._sent_again(stamps_ns)])
         messages = np.concatenate([self._rest, new], axis=1)
         starts = self._starts(messages[0])
-        if len(starts) < 2:
+        if len(starts) == 1:
             self._rest = messages
             return []
         self._rest = messages[:, starts[-1] :]
@@ -109,13 +111,10 @@ class StepWatch:
 
     def _starts(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return where groups begin in the messages that are not grouped yet; the last is open."""
-        number = np.arange(len(stamps_ns))
-        begins = np.r_[True, np.diff(stamps_ns) != 0] if len(number) else number > 0
-        since = np.maximum.accumulate(np.where(begins, number, 0))
-        begins |= (number - since) % MOST_ALIKE == 0
-        first = number[begins]
+        alike = np.arange(len(stamps_ns)) - _first_alike(stamps_ns)
+        first = np.flatnonzero(alike % MOST_ALIKE == 0)
         group = (first + self._n_grouped) // GROUP
-        return first[np.r_[True, np.diff(group) != 0]] if len(first) else first
+        return first[np.r_[True, np.diff(group) != 0]]
 
     def _sent_again(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return which messages bear a stamp from before the last change of stamps, (n,).
@@ -124,16 +123,13 @@ class StepWatch:
         """
         known = np.concatenate([self._remembered_ns, stamps_ns])
         self._remembered_ns = known[-2 * REMEMBERED :]
-        changes = np.diff(known)
-        if not (changes < 0).any():
+        if not (np.diff(known) < 0).any():
             return np.zeros(len(stamps_ns), dtype=bool)
         order = np.argsort(known, kind="stable")
         alike = known[order[1:]] == known[order[:-1]]
         ago = np.full(len(known), REMEMBERED + 1)
         ago[order[1:][alike]] = np.diff(order)[alike]
-        begins = np.r_[True, changes != 0]
-        since = np.maximum.accumulate(np.where(begins, np.arange(len(known)), 0))
-        return (ago[since] <= REMEMBERED)[len(known) - len(stamps_ns) :]
+        return (ago[_first_alike(known)] <= REMEMBERED)[-len(stamps_ns) :]
 
     def _look(self) -> list[ClockStep]:
         """Return the steps within a group with neighbours on both sides."""
@@ -182,6 +178,13 @@ class StepWatch:
             offset_ns = max(offset_ns, nearest_ns - max(received_ns - when, 0) // SLEW)
         self._nearest = offset_ns, received_ns
         return self._nearest
+
+
+def _first_alike(stamps_ns: np.ndarray) -> np.ndarray:
+    """Return the first of the messages in a row that share the stamp of each, (n,)."""
+    number = np.arange(len(stamps_ns))
+    begins = np.r_[True, np.diff(stamps_ns) != 0]
+    return np.maximum.accumulate(np.where(begins, number, 0))
 
 
 def _parted(
