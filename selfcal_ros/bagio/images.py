@@ -15,7 +15,7 @@ import numpy as np
 from mcap.records import Channel, Message, Schema
 
 from selfcal_ros.bagio.mcap_stream import streams
-from selfcal_ros.bagio.messages import from_model
+from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.bagio.reader import CLOCK_LIMIT_S, BagReader, overlap
 from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
@@ -28,6 +28,7 @@ from selfcal_ros.collection.inputs import (
 )
 from selfcal_ros.errors import InputError, NoDataError, known_are
 from selfcal_ros.files import csv_rows, read_bytes, read_text
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.topics import (
@@ -434,6 +435,26 @@ class ImageBag:
         """What stands before the names of the contract, with its slashes."""
         role = next(role for role in IMAGE_TOPICS.values() if self.topic.endswith(role))
         return self.topic.removesuffix(role)
+
+    def plates(self) -> Iterator[Artifact]:
+        """Yield the plates of the view commands of this cell.
+
+        An unusable command has none here: whoever solves the bag is told of it.
+
+        Raises
+        ------
+        InputError
+            If a topic of the cell has another type.
+        """
+        for role, item in BagReader(self.path, self.space).columns():
+            if role != COMMAND_TOPIC:
+                continue
+            try:
+                plate = to_model.command(item).artifact
+            except InputError:
+                continue
+            if plate is not None:
+                yield plate
 
     def items(self) -> Iterator[Item]:
         """Yield all messages in the order of the files.

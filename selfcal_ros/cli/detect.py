@@ -9,9 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
-from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.bagio.offline import TRUTH_FILE
-from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.terminal import (
     add_json,
     add_parameters,
@@ -27,7 +25,6 @@ from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.settings.parameter import TYPED
-from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.vision.detector import Judged
 from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector
@@ -94,9 +91,11 @@ def run(args: argparse.Namespace) -> int:
     if args.positions:
         problems = _from_files(args, detector, settings)
     else:
+        images = ImageBag(Path(args.bag), args.namespace)
         if settings.aruco:
-            _require_plates(args, settings)
-        problems = ImageBag(Path(args.bag), args.namespace).write_detected(
+            for plate in images.plates():
+                settings.require_plate(plate, args.params or TYPED)
+        problems = images.write_detected(
             args.output,
             detector.take,
             check=partial(detector.refuse_nothing, args.bag),
@@ -133,21 +132,6 @@ def _from_files(
         check=partial(detector.refuse_nothing, args.bag),
         frame_id=settings.frame_id,
     )
-
-
-def _require_plates(args: argparse.Namespace, settings: DetectorSettings) -> None:
-    """Refuse markers of another plate than that of a command in the bag."""
-    space = args.namespace
-    bag = BagReader(Path(args.bag), None if space is None else space.strip("/"))
-    for role, item in bag.columns():
-        if role != COMMAND_TOPIC:
-            continue
-        try:
-            plate = to_model.command(item).artifact
-        except InputError:  # as of a stranger: the collector refuses it with its reason
-            continue
-        if plate is not None:
-            settings.require_plate(plate, args.params or TYPED)
 
 
 def _empty(name: str) -> Path:

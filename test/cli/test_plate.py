@@ -3,12 +3,14 @@
 
 import re
 import sys
+from shutil import copyfile
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.cli.detect import text_of
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
@@ -19,6 +21,9 @@ from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
+from test.support.bags import Foreign
+from test.support.plans import plan_of
+from test.support.sessions import events_of
 from test.support.sources import ROOT
 
 PLAN = """plan_id: tiny
@@ -240,6 +245,15 @@ def test_markers_are_those_of_the_plate_in_the_commands_of_a_bag(tmp_path, capsy
         "aruco: '4x6', but the plate of the plan has 5 x 5" in capsys.readouterr().err
     )
     assert not (tmp_path / "out").exists()
+
+
+def test_the_plates_of_a_bag_are_those_of_the_cell_with_the_images(tmp_path):
+    """Another cell in it has no images, and needs no --namespace."""
+    bag = tmp_path / "bag"
+    other = events_of(plan_of("0, 90, tx", 3, count=4))
+    Foreign(namespace="/other").write(bag / "other.mcap", other)
+    copyfile(ROOT / "bags/camera/camera_0.mcap", bag / "camera.mcap")
+    assert {plate.shape for plate in ImageBag(bag).plates()} == {(5, 5)}
 
 
 def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):
