@@ -916,14 +916,14 @@ def _common(
 
 
 def _polynomials(x: np.ndarray, y: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
-    """Return polynomials of position up to `DEGREE` as columns over Gx, then Gy; the shear first.
+    """Return polynomials of position up to `DEGREE` as columns over Gx, then Gy.
 
-    The first two are non-orthogonality O and scale difference R (Hu eq. 6).
+    The first three are magnification, non-orthogonality O and scale difference R (Hu eq. 6).
     """
     size = max(np.abs(x).max(), np.abs(y).max())
     x, y = x[known_sites] / size, y[known_sites] / size
     zero = np.zeros(len(x))
-    columns = [(y, x), (x, -y)]
+    columns = [(x, y), (y, x), (x, -y)]
     for degree in range(2, DEGREE + 1):
         for power in range(degree + 1):
             values = x ** (degree - power) * y**power

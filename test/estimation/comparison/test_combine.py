@@ -538,6 +538,30 @@ def test_lengths_of_different_certificates_explain_that_magnifications_differ():
     assert all(run.agrees for run in found.result.parts.combined.runs)
 
 
+def test_magnifications_that_differ_have_one_degree_of_freedom():
+    """Two runs whose scales are 10 µm/m apart, as of a stage that was 1 K warmer: U covers both.
+
+    It was shared out among the cubic polynomials, with more degrees of freedom than runs tell.
+    """
+    length = ReferenceLength("artifact", 1e-5, 1e-7, "PTB 1")
+    options = Options(assumed=(), causes=False, reference=length)
+    runs = [part(name, calibrated(len(name), options=options)) for name in ("a", "bb")]
+    warmer = replace(
+        runs[1].error_map,
+        gx=runs[1].error_map.gx + 1e-5 * ARTIFACT.x_m,
+        gy=runs[1].error_map.gy + 1e-5 * ARTIFACT.y_m,
+    )
+    runs[1] = part("warmer", replace(runs[1].result, error_map=warmer))
+    found = combine(runs, keep_scale=True)
+    assert found.result.verdict.grade is Grade.ENLARGED
+    assert found.result.noise.k_xy == pytest.approx(coverage_factor(1.0), rel=1e-3)
+    place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()])
+    assert np.corrcoef(found.xy.between, place**2)[0, 1] > 0.999
+    scale = place / (place @ place)
+    u_scale = np.sqrt(scale @ found.xy.covariance @ scale)
+    assert u_scale == pytest.approx(1e-5 / 2, rel=0.05)
+
+
 def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
     """x y in Gx and two waves per turn, amplitudes -1, 0, 1 of 1 µm and 1 mrad."""
     x, y = ARTIFACT.x_m / 0.03, ARTIFACT.y_m / 0.03
