@@ -300,6 +300,17 @@ class ScaleChanged(Finding):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ScaleNotCompared(Finding):
+    """The map in `of`, a file, has a scale; the temperature of the plate now is not stated.
+
+    `certified`: whether that of the calibration was.
+    """
+
+    of: str
+    certified: bool
+
+
+@dataclass(frozen=True, kw_only=True)
 class MicroscopeOff(Finding):
     """The microscope has another scale (`size`) and turn, rad, than assumed; it was corrected."""
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.findings import ScaleNotCompared
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import UM_PER_M
 
@@ -158,11 +159,13 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
 def scale_texts(result: CalibrationResult) -> list[str]:
     """Return what sets the scale of a map, and whether it is traceable."""
     if result.reference is None:
-        why = (
-            "the temperature of the known plate in this measurement was not stated"
-            if result.recheck is not None
-            else "no reference length was used"
-        )
+        why = "no reference length was used"
+        if any(isinstance(finding, ScaleNotCompared) for finding in result.findings):
+            why = (
+                "the temperature of the known plate in this measurement was not stated"
+            )
+        elif result.parts.combined is not None:
+            why = "the magnification of each run was removed from the mean"
         return [
             f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
             "straightness and squareness do not depend on a reference."

@@ -99,6 +99,7 @@ from selfcal_ros.model.findings import (
     MicroscopeOff,
     PlateMisfit,
     ScaleChanged,
+    ScaleNotCompared,
 )
 from selfcal_ros.model.kept import SlowKept
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
@@ -295,7 +296,16 @@ def recheck(
         ),
         rejected=measurements.all_rejected(),
         findings=(
-            *(() if failed else (*changes, *_scale_changes(outcome), *_off(solved))),
+            *(
+                ()
+                if failed
+                else (
+                    *changes,
+                    *_scale_changes(outcome),
+                    *_scale_not_compared(plate),
+                    *_off(solved),
+                )
+            ),
             *views_findings(measurements),
         ),
         sense=str(measurements.sense),
@@ -384,6 +394,14 @@ def _scale_changes(outcome: Recheck) -> Iterator[ScaleChanged]:
             passes=outcome.passes,
             of=outcome.of,
         )
+
+
+def _scale_not_compared(plate: KnownPlate) -> Iterator[ScaleNotCompared]:
+    """Yield a finding if the map before has a scale, and this one has none."""
+    before = plate.result.reference
+    if before is not None and plate.reference is None:
+        certified = before.kind.of_plate and before.certified is not None
+        yield ScaleNotCompared(of=plate.where, certified=certified)
 
 
 def _off(solved: Rechecked) -> Iterator[Finding]:

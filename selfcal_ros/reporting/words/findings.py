@@ -44,6 +44,7 @@ from selfcal_ros.model.findings import (
     Remedy,
     RestNotConverged,
     RoughnessUntested,
+    ScaleNotCompared,
     ScaleOfOffsets,
     SignNotShown,
     SignShownByLines,
@@ -339,6 +340,7 @@ for _text_of in (
     phrases.other_plate_text,
     phrases.repeats_contradict_text,
     phrases.scale_changed_text,
+    phrases.scale_not_compared_text,
     phrases.view_left_out_text,
 ):
     sentence_of.register(_text_of)
@@ -659,7 +661,13 @@ def worded(result: CalibrationResult) -> CalibrationResult:
             verdict, sentence="Good: the runs agree within their uncertainties"
         )
     if result.recheck is not None and verdict.qualified:
-        verdict = replace(verdict, sentence=phrases.recheck_sentence(result.recheck))
+        sentence = phrases.recheck_sentence(
+            result.recheck,
+            without_scale=any(
+                isinstance(finding, ScaleNotCompared) for finding in findings
+            ),
+        )
+        verdict = replace(verdict, sentence=sentence)
     return replace(
         result,
         verdict=verdict,

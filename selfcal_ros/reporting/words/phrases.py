@@ -30,6 +30,7 @@ from selfcal_ros.model.findings import (
     PlateMisfit,
     RepeatsContradict,
     ScaleChanged,
+    ScaleNotCompared,
     ViewLeftOut,
 )
 from selfcal_ros.model.kept import LACK_OF_FIT
@@ -208,8 +209,11 @@ ONE_PASS = (
 )
 
 
-def recheck_sentence(recheck: Recheck) -> str:
-    """Return the verdict of a recheck in one sentence."""
+def recheck_sentence(recheck: Recheck, *, without_scale: bool = False) -> str:
+    """Return the verdict of a recheck in one sentence.
+
+    `without_scale`: the map before has a scale, which was not compared.
+    """
     since = _since(recheck.of)
     scale = recheck.scale
     clearest = _clearest(recheck.largest)
@@ -220,8 +224,9 @@ def recheck_sentence(recheck: Recheck) -> str:
             f"{_scale_changed(since, scale, one_pass=recheck.passes == 1)}; otherwise no "
             f"change beyond its uncertainty ({p_text(recheck.p)}); {clearest}"
         )
+    still = STILL_GOOD + ", but for its scale, not compared" * without_scale
     return (
-        f"{STILL_GOOD}: no change since {since} beyond its uncertainty ({p_text(recheck.p)}); "
+        f"{still}: no change since {since} beyond its uncertainty ({p_text(recheck.p)}); "
         f"{clearest}"
     )
 
@@ -256,6 +261,19 @@ def scale_changed_text(finding: ScaleChanged) -> str:
     """Return the warning of encoders whose scale against the plate has changed."""
     scale = ScaleChange(True, finding.size, finding.u, finding.p)
     return _scale_changed(_since(finding.of), scale, one_pass=finding.passes == 1)
+
+
+def scale_not_compared_text(finding: ScaleNotCompared) -> str:
+    """Return the warning of a scale that a recheck does not compare."""
+    remedy = (
+        "name the temperature of the plate in this measurement (--reference-at)"
+        if finding.certified
+        else "calibrate with --reference and --reference-at of the plate"
+    )
+    return (
+        f"the scale of {_since(finding.of)} was not compared: a stage that has grown as the plate "
+        f"has looks unchanged; {remedy}"
+    )
 
 
 def other_plate_text(finding: OtherPlate) -> str:

@@ -92,6 +92,33 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
     assert changed <= binom.ppf(0.999, STAGES, 0.05) if told else changed == STAGES
 
 
+def test_a_stage_that_has_grown_as_its_plate_is_not_called_still_good():
+    """3 K, both 8 µm/m/K: its map, which has a scale, is 24 µm/m off, and nothing differs."""
+    readings, again = (
+        simulate_measurements(
+            random_truth(PLAN.artifact, 3, np.random.default_rng(1)),
+            plan,
+            np.random.default_rng(seed),
+            sigma_m=2e-8,
+        )
+        for seed, plan in enumerate((PLAN, replace(PLAN, views=PLAN.views[:1])))
+    )
+    length = ReferenceLength(ReferenceKind.ARTIFACT, LENGTH, U_LENGTH, "C 1")
+    for reference, remedy in (
+        (length.at_temperature("20.4:0.05:8e-6:4e-7"), "(--reference-at)"),
+        (length, "calibrate with --reference"),
+        (None, None),
+    ):
+        before = calibrate(readings, Options(reference=reference, causes=False))
+        now = worded(recheck(again, Options(), known_plate(worded(before), "r.json")))
+        (warning,) = now.warnings or (None,)
+        still = "Still good, but for its scale, not compared: no change since r.json"
+        assert now.verdict.sentence.startswith(still) is (remedy is not None)
+        assert warning is remedy or remedy in warning
+        why = scale_texts(now)[0]
+        assert ("known plate in this measurement was not stated" in why) is bool(remedy)
+
+
 def test_what_was_converted_is_stated():
     told, _ = session(1, 0.5)
     assert told.reference.certified.temperature_c == pytest.approx(20.9, abs=0.2)

@@ -37,6 +37,7 @@ from selfcal_ros.model.findings import (
     ReferenceOff,
     Remedy,
     RestNotIdentified,
+    ScaleNotCompared,
     SlipBefore,
     SlipFound,
     SlipsGivenUp,
@@ -455,6 +456,16 @@ FINDINGS = [
     (
         PredictionFailed(size=3.456, tenth=2, limit=1.2),
         "a random tenth (2) is predicted with 3.46 times the noise, beyond the limit of 1.20",
+    ),
+    (
+        ScaleNotCompared(of="stage/before.json", certified=True),
+        "the scale of before.json was not compared: a stage that has grown as the plate has looks "
+        "unchanged; name the temperature of the plate in this measurement (--reference-at)",
+    ),
+    (
+        ScaleNotCompared(of="before.json", certified=False),
+        "the scale of before.json was not compared: a stage that has grown as the plate has looks "
+        "unchanged; calibrate with --reference and --reference-at of the plate",
     ),
     (
         NoUncertainty(),
