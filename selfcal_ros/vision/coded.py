@@ -14,9 +14,21 @@ from selfcal_ros.vision.detector import Mark, MarkFault
 from selfcal_ros.vision.images import Picture
 
 AGREE = 0.15
-"""Largest distance of a corner from its place, pitches, at which markers are believed."""
+"""Largest distance of a corner or mark from its place, pitches, at which markers are believed."""
 NEAR = 0.25
 """Largest distance of a mark from its place on the lattice, pitches."""
+SAMPLED = 3
+"""Every which row and column of an image its black and white are taken from."""
+
+
+def stretched(values: np.ndarray) -> np.ndarray:
+    """Return grey values as uint8 from black to white, whatever the exposure and the bits are.
+
+    One pixel in a thousand may be darker, one brighter: hot pixels, reflections.
+    """
+    low, high = np.percentile(values[::SAMPLED, ::SAMPLED], (0.1, 99.9))
+    grey = (values - low) * (255.0 / max(high - low, 1.0))
+    return np.ascontiguousarray(np.clip(grey, 0, 255), dtype=np.uint8)
 
 
 class CodedPlate:
@@ -32,7 +44,7 @@ class CodedPlate:
     Attributes
     ----------
     contradicting : int
-        Images whose markers do not lie as on this plate, so that none is believed.
+        Images whose markers or marks do not lie as on this plate, so that no marker is believed.
 
     Raises
     ------
@@ -77,7 +89,7 @@ class CodedPlate:
             Whether it is mirrored, columns along -x.
         """
         values = picture.values[:, ::-1] if mirror else picture.values
-        places = self._places(values, picture.full_scale)
+        places = self._places(values)
         if places is None:
             return [None] * len(marks)
         last = values.shape[1] - 1
@@ -85,17 +97,18 @@ class CodedPlate:
             [(last - mark.u if mirror else mark.u) - 1j * mark.v for mark in marks]
         )
         place_of, markers = places
-        return [self._id(place_of(pixel), markers) for pixel in pixels.tolist()]
+        ids = [self._id(place_of(pixel), markers) for pixel in pixels.tolist()]
+        if not _on_lattice(pixels, ids):
+            self.contradicting += 1
+            return [None] * len(marks)
+        return ids
 
-    def _places(self, values: np.ndarray, full_scale: int) -> Any:
+    def _places(self, values: np.ndarray) -> Any:
         """Return the function from pixel to plate, and the markers seen; None without them.
 
         Pixels are u - iv, places x + iy in pitches: a turn, a scale and a shift, by least squares.
         """
-        grey = np.ascontiguousarray(
-            np.clip(values * (255.0 / full_scale), 0, 255), dtype=np.uint8
-        )
-        corners, numbers, _ = self._reader.detectMarkers(grey)
+        corners, numbers, _ = self._reader.detectMarkers(stretched(values))
         if numbers is None:
             return None
         numbers = np.ravel(numbers)
@@ -106,9 +119,8 @@ class CodedPlate:
         pixels = np.reshape(corners, (-1, 4, 2))[on_plate]
         pixel = (pixels[..., 0] - 1j * pixels[..., 1]).ravel()
         place = (markers[:, None] + CORNERS) @ (1, 1j)
-        columns = np.stack([pixel, np.ones_like(pixel)], axis=1)
-        factor, shift = np.linalg.lstsq(columns, place.ravel(), rcond=None)[0]
-        if np.abs(factor * pixel + shift - place.ravel()).max() > AGREE:
+        (factor, shift), away = _similarity(pixel, place.ravel())
+        if away > AGREE:
             self.contradicting += 1
             return None
         return lambda place_px: factor * place_px + shift, markers
@@ -129,3 +141,30 @@ class CodedPlate:
             return None
         m, n = (nearest - self._shape // 2).astype(int).tolist()
         return m, n
+
+
+def _similarity(pixel: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return factor and shift from pixels to places, complex, and the largest residual."""
+    columns = np.stack([pixel, np.ones_like(pixel)], axis=1)
+    solution = np.linalg.lstsq(columns, place, rcond=None)[0]
+    return solution, float(np.abs(columns @ solution - place).max())
+
+
+def _on_lattice(
+    pixels: np.ndarray, ids: Sequence[tuple[int, int] | MarkFault | None]
+) -> bool:
+    """Return whether most marks, at these pixels, have ids, which lie as on the plate.
+
+    Otherwise a marker is read wrongly: one that is cut by the border of the image may have another
+    size, which shows at marks that are far from it.
+    """
+    has_id = np.array([isinstance(mark_id, tuple) for mark_id in ids], dtype=bool)
+    others = sum(mark_id is None for mark_id in ids)
+    if others >= max(has_id.sum(), 1):
+        return False
+    if not has_id.any():
+        return True
+    place = np.array(
+        [complex(*mark_id) for mark_id in ids if isinstance(mark_id, tuple)]
+    )
+    return _similarity(pixels[has_id], place)[1] <= AGREE

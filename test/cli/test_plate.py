@@ -208,6 +208,44 @@ def test_markers_that_do_not_lie_as_on_the_plate_name_no_mark_and_are_counted(
     assert "1 image without ids" in text_of("bag", counts)
 
 
+class Shrunk:
+    """A reader that gives the first marker alone, smaller than it is: cut by the border."""
+
+    def __init__(self, reader):
+        self.reader = reader
+
+    def detectMarkers(self, values):
+        corners, numbers, rejected = self.reader.detectMarkers(values)
+        corner = corners[0]
+        middle = corner.mean(axis=1, keepdims=True)
+        return [middle + 0.75 * (corner - middle)], numbers[:1], rejected
+
+
+def test_a_marker_that_the_marks_contradict_is_not_believed(coded_svg):
+    picture, _ = photographed(
+        coded_svg, np.random.default_rng(1), turn=0.3, centre=(2.0, 0), mirror=False
+    )
+    sizes = {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4, "aruco": "6x5"}
+    detector = ImageDetector(DetectorSettings.checked(sizes, "test"))
+    assert all(each.has_id for each in detector.take_picture(picture, 1))
+    detector._coded._reader = Shrunk(detector._coded._reader)
+    assert not any(each.has_id for each in detector.take_picture(picture, 2))
+    assert detector.counts.contradicting == 1
+
+
+@pytest.mark.parametrize("factor", [16, 0.15])
+def test_markers_are_read_whatever_the_exposure_and_the_bits(coded_svg, factor):
+    """12 bits in 16, and a dark image."""
+    picture, _ = photographed(
+        coded_svg, np.random.default_rng(1), turn=0.3, centre=(2.5, -2.0), mirror=False
+    )
+    values = np.round(factor * picture.values.astype(float)).astype(np.uint16)
+    sizes = {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4, "aruco": "6x5"}
+    detector = ImageDetector(DetectorSettings.checked(sizes, "test"))
+    marks = detector.take_picture(Picture(values, 65535), 1)
+    assert marks and all(each.has_id for each in marks)
+
+
 def test_a_camera_knows_which_marks_it_sees(coded_svg):
     """Ids and centres in ten images at any turn, shift and blur, mirrored or not."""
     assert sum(identify(coded_svg, seed) for seed in range(10)) > 30
