@@ -82,8 +82,8 @@ class DetectorSettings(ManagedSettings):
     )
     full_scale: int = declared(
         0,
-        "value of a saturated pixel, e.g. 4095 of a camera with 12 bits in mono16; 0 = the "
-        "largest of the encoding",
+        "value of a saturated pixel; 0 = the largest of the encoding, or of a camera with 9 to 15 "
+        "bits in mono16 where an image ends at it (4095)",
         "",
         0,
         65535,

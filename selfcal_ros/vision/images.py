@@ -186,5 +186,19 @@ def _values(picture: Image.Image) -> Picture:
 def _grey(values: np.ndarray) -> Picture:
     full = int(np.iinfo(values.dtype).max)
     if values.shape[2] == 1:
-        return Picture(values[:, :, 0], full)
+        return Picture(values[:, :, 0], _saturated_at(values, full))
     return Picture(values.sum(axis=2, dtype=np.uint16), 3 * full)
+
+
+def _saturated_at(values: np.ndarray, full: int) -> int:
+    """Return the value of a saturated pixel of a camera of 9 to 16 bits.
+
+    That is the largest of the encoding, unless the image ends at the largest value of fewer bits,
+    which are the low ones or the high ones: 4095 or 65520 of 12 bits.
+    """
+    largest = int(values.max(initial=0))
+    bits = full.bit_length()
+    ends = {
+        end for n in range(9, bits) for end in (2**n - 1, full + 1 - 2 ** (bits - n))
+    }
+    return largest if largest in ends else full

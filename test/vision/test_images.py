@@ -251,6 +251,16 @@ def test_the_full_scale_is_that_of_the_bits():
     assert decoded(tiff(WIDE, (339, 2)), "f.tif").full_scale == 32767
 
 
+@pytest.mark.parametrize(
+    ("largest", "full"),
+    [(4095, 4095), (0xFFF0, 0xFFF0), (1023, 1023), (4094, 65535), (255, 65535)],
+)
+def test_16_bits_with_a_camera_of_fewer_saturate_where_they_end(largest, full):
+    """The low or the high bits; what ends elsewhere is not saturated."""
+    values = np.array([[100, largest, largest, 7]], np.uint16)
+    assert decoded(saved(Image.fromarray(values), "PNG"), "f.png").full_scale == full
+
+
 def test_a_tiff_of_one_bit_without_a_tag_for_it():
     data = saved(
         Image.fromarray((GREY > 5).astype(np.uint8) * 255).convert("1"), "TIFF"
