@@ -15,8 +15,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.reporting.summary.numbers import with_u
 from selfcal_ros.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.units import M_PER_UM
-from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
-from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE
+from selfcal_ros.vision.camera_pose import SHORT, CameraPose, camera_pose, require_size
+from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE, rejected_text
 from selfcal_ros.vision.exposures import ImageDetector
 
 SIZE_OPTION = "--mark-pixels"
@@ -31,8 +31,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "init",
         help="from a few moves of the stage",
         description="Follows marks in images taken "
-        "while the stage stands at a few positions in x and y, less than half the distance between "
-        "two marks apart, and writes the parameters of mark_detector.",
+        f"while the stage stands at a few positions in x and y, {SHORT} apart, and writes the "
+        "parameters of mark_detector.",
     )
     init.add_argument(
         "bag",
@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         warn(
             args,
             f"{args.bag}: {counts.empty} of {counts.images} images show no mark "
-            "and are left out",
+            f"and are left out{rejected_text(counts.rejected)}",
         )
     camera = camera_pose(positions, images, Sense(args.sense))
     require_size(

@@ -15,6 +15,15 @@ NOT_SIMILAR = 0.02
 """Relative difference of the two axes, or shear, above which a camera is refused."""
 TOO_UNCERTAIN = 0.02
 """Relative standard uncertainty of the size of a pixel above which a camera is refused."""
+FOLLOWED = 1 / (2 + DetectorSettings().size_tolerance)
+"""Part of the distance of two marks over which a mark is followed from image to image.
+
+Where the stage moves by more than half of the distance d, each mark seems to move the other way,
+by the rest. Of a rest of more than this part of d, the pixels are off by less than the
+tolerance of the size of marks, which then does not show it.
+"""
+SHORT = "less than 0.4 times the distance of two marks"
+"""Moves that are followed."""
 LEAST_SPAN = 0.1
 """Smallest extent of the positions over the largest one."""
 
@@ -50,8 +59,8 @@ class CameraPose:
 def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the number of the track of each mark, image by image.
 
-    A mark continues the nearest one of the image before, if it has moved by less than half the
-    smallest distance between two marks; a single mark per image is always the same one.
+    A mark continues the nearest one of the image before, if it has moved by less than `FOLLOWED`
+    of the smallest distance between two marks; a single mark per image is always the same one.
 
     Parameters
     ----------
@@ -64,7 +73,7 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
         for i in range(len(places))
         for j in range(i)
     ]
-    limit = min(distances_px) / 2 if distances_px else np.inf
+    limit = FOLLOWED * min(distances_px) if distances_px else np.inf
     numbers: list[np.ndarray] = []
     count = 0
     before = np.zeros((0, 2))
@@ -117,8 +126,7 @@ def camera_pose(
         raise NoDataError(
             "images",
             f"{len(number)} readings of {count} marks that were followed",
-            "move the stage in x and y by less than half the distance of two marks, "
-            "so that marks stay in the image",
+            f"move the stage in x and y by {SHORT}, so that marks stay in the image",
         )
     stage = (
         stage
@@ -179,16 +187,15 @@ def _similar(
             "images",
             "the marks do not follow the stage: the size of a pixel has a standard "
             f"uncertainty of {u[0] / components[0]:.2g} of itself",
-            "move the stage from image to image by less than half the distance of "
-            "two marks, and check the positions",
+            f"move the stage from image to image by {SHORT}, and check the positions",
         )
     sheared = float(np.hypot(*components[2:]))
     if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
         raise InputError(
             "images",
             f"the image of the motion is sheared by {100 * sheared:.1f} %",
-            "check that the moves are shorter than half the distance of two marks, "
-            "and that the encoder axes are those of the camera's stage",
+            f"check that the moves are {SHORT}, and that the encoder axes are those of the "
+            "camera's stage",
         )
     return CameraPose(
         float(components[0]),

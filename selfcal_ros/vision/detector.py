@@ -17,7 +17,7 @@ from selfcal_ros.vision.finding import Candidate, candidates
 from selfcal_ros.vision.fitting import Fit, Windows, fit_marks, lie_inside, windows_of
 from selfcal_ros.vision.images import Picture
 from selfcal_ros.vision.models import MODELS
-from selfcal_ros.vision.shown import spots_in
+from selfcal_ros.vision.shown import alternates, spots_in
 
 SMALLEST_SIZE, LARGEST_SIZE = 6.0, 2000.0
 """Range of the size of a mark, px."""
@@ -50,6 +50,17 @@ class MarkFault(StrEnum):
     WEAK = "weak"
     DOUBLE = "double"
     MARKER = "part_of_a_marker"
+
+
+REMEDIES: dict[str, str] = {
+    MarkFault.SATURATED: "expose shorter, and take the images again",
+    MarkFault.DEFOCUSED: "focus, and take the images again",
+    MarkFault.WEAK: "expose longer or raise the contrast, and take the images again",
+}
+"""Reason for which most marks are rejected -> what to do, if other settings do not help.
+
+Blurred marks look larger than they are.
+"""
 
 
 @dataclass(frozen=True)
@@ -303,18 +314,33 @@ class MarkDetector:
             f"{self.size:.3g} px was found"
         )
         summary = none_found + rejected_text(rejected)
+        cut_off = rejected[MarkFault.CUT_OFF]
+        inside = rejected - Counter({str(MarkFault.CUT_OFF): cut_off})
+        most = next((reason for reason, _ in inside.most_common(1)), "")
         spots = None if picture is None else spots_in(picture.values)
         if spots is None:
-            return f"{summary}; nothing repeats in them", "check exposure and focus"
+            return f"{summary}; nothing repeats in them", REMEDIES.get(
+                most,
+                "let whole marks lie in the image, half their size free around them; "
+                "check exposure and focus"
+                if cut_off and not inside
+                else "check exposure and focus",
+            )
+        what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+        if picture is not None and alternates(picture.values):
+            return (
+                what,
+                "let the camera give grey or colour images, not a Bayer pattern",
+            )
+        if most in REMEDIES:
+            return what, REMEDIES[most]
+        if spots.side_px < SMALLEST_SIZE:
+            return what, f"magnify them: a mark has at least {SMALLEST_SIZE:g} pixels"
         options = []
         if abs(spots.side_px / self.size - 1) > settings.size_tolerance:
             options.append(f"{size_option} {spots.side_px * settings.pixel_size:.2g}")
         if self._sign and spots.polarity != settings.polarity:
             options.append(f"--polarity {spots.polarity}")
-        what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
-        if [reason for reason, _ in rejected.most_common(1)] == [MarkFault.DEFOCUSED]:
-            # blurred marks look larger than they are
-            return what, "focus, and take the images again"
         return what, (
             f"try {' '.join(options)}"
             if options

@@ -14,6 +14,10 @@ ALIKE = 0.3
 LARGEST = 0.5
 """Largest side of a spot, over the shorter side of the image."""
 
+ALTERNATING = 0.1
+"""Difference of the means of every other row and column, over the spread of all pixels, above
+which it is not chance."""
+
 
 @dataclass(frozen=True)
 class Spots:
@@ -28,7 +32,8 @@ def spots_in(image: np.ndarray) -> Spots | None:
     """Return the most frequent kind of spots in an image (h, w); None if there are none.
 
     Dark and bright parts about a threshold between the two (Otsu) are compared: those of the
-    marks are small, alike, and do not reach the border of the image.
+    marks are small, most of them alike, and do not reach the border of the image. Parts of noise
+    are of all sizes, and specks cover more of the image than they do.
     """
     level = _threshold(image)
     if level is None:
@@ -39,6 +44,12 @@ def spots_in(image: np.ndarray) -> Spots | None:
         if (spots := _alike(mask, polarity)) is not None
     ]
     return max(kinds, key=lambda spots: spots.number, default=None)
+
+
+def alternates(image: np.ndarray) -> bool:
+    """Return whether every other row or column is brighter: raw values of a colour camera."""
+    means = [image[row::2, column::2].mean() for row in (0, 1) for column in (0, 1)]
+    return bool(np.ptp(means) > ALTERNATING * image.std())
 
 
 def _threshold(image: np.ndarray) -> float | None:
@@ -64,8 +75,12 @@ def _alike(mask: np.ndarray, polarity: str) -> Spots | None:
     labels, number = ndimage.label(mask)
     if not number:
         return None
-    sides = []
-    for rows, columns in ndimage.find_objects(labels):
+    areas = np.bincount(labels.ravel())[1:]
+    sides, spot_areas = [], []
+    speck_area = 0
+    for (rows, columns), area in zip(
+        ndimage.find_objects(labels), areas.tolist(), strict=True
+    ):
         inside = (
             rows.start > 0
             and columns.start > 0
@@ -73,10 +88,15 @@ def _alike(mask: np.ndarray, polarity: str) -> Spots | None:
             and columns.stop < mask.shape[1]
         )
         side = (rows.stop - rows.start + columns.stop - columns.start) / 2
-        if inside and SMALLEST <= side <= LARGEST * min(mask.shape):
+        if side < SMALLEST:
+            speck_area = speck_area + area
+        elif inside and side <= LARGEST * min(mask.shape):
             sides.append(side)
+            spot_areas.append(area)
     if not sides:
         return None
     typical = median_high(sides)  # one of them, so that it is like itself
-    alike = [side for side in sides if abs(side - typical) <= ALIKE * typical]
-    return Spots(float(np.mean(alike)), polarity, len(alike))
+    alike = np.abs(np.array(sides) - typical) <= ALIKE * typical
+    if 2 * alike.sum() < len(sides) or np.sum(spot_areas, where=alike) < speck_area:
+        return None
+    return Spots(float(np.mean(sides, where=alike)), polarity, int(alike.sum()))

@@ -185,9 +185,22 @@ def test_moves_by_a_whole_pitch_are_refused(tmp_path, capsys, monkeypatch):
     [line] = capsys.readouterr().err.splitlines()
     assert (
         "the marks do not follow the stage" in line
-        and "less than half the distance" in line
+        and "less than 0.4 times the distance" in line
     )
     assert not (tmp_path / "nodes.yaml").exists()
+
+
+@pytest.mark.parametrize("part", [0.51, 0.53, 0.545])
+def test_moves_by_half_a_pitch_are_refused(tmp_path, capsys, monkeypatch, part):
+    """Marks seem to move the other way: a camera turned by 180°, with pixels of nearly its size."""
+    pitch = 2e-4
+    moves = [(x * part * pitch, y * part * pitch) for x, y in ((0, 0), (1, 0), (1, 1))]
+    lattice = pitch * np.stack(np.mgrid[-3:4, -3:4]).reshape(2, -1)
+    monkeypatch.setattr(f"{__name__}.MOVES", [*moves, (0.0, part * pitch)])
+    monkeypatch.setattr(f"{__name__}.MARKS", lattice)
+    bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 4
+    assert "less than 0.4 times the distance of two marks" in capsys.readouterr().err
 
 
 def table_of(folder, factor_x, factor_y):
@@ -266,17 +279,42 @@ def test_images_without_the_mark_say_what_they_show(tmp_path, capsys, options, s
     assert said in said_of_images(tmp_path, capsys, *options)
 
 
-def test_blurred_images_are_to_be_focused(tmp_path, capsys):
-    """Blurred marks look larger: their size is right."""
-    said = said_of_images(tmp_path, capsys, blur_px=8)
-    assert "defocused" in said and "; focus, and take the images again" in said
+@pytest.mark.parametrize(
+    ("change", "reason", "remedy"),
+    [
+        # blurred marks look larger: their size is right
+        (lambda v: ndimage.gaussian_filter(v, 8), "defocused", "; focus, and take"),
+        (lambda v: np.clip(2.0 * v, 0, 255), "saturated", "; expose shorter, and"),
+        (
+            lambda v: v * MOSAIC,
+            "px, dark",
+            "; let the camera give grey or colour images",
+        ),
+        (lambda v: noise(v, 4) + 100, "was found; nothing", "; check exposure and foc"),
+        # the rows of marks are 35 px apart, the upper one is at row 55
+        (lambda v: v[50:86], "cut_off; nothing", "; let whole marks lie in the image"),
+    ],
+)
+def test_images_that_cannot_be_used_say_how_to_take_them(
+    tmp_path, capsys, change, reason, remedy
+):
+    said = said_of_images(tmp_path, capsys, change=change)
+    assert reason in said and remedy in said
 
 
-def said_of_images(tmp_path, capsys, *options, blur_px=0.0):
+MOSAIC = np.tile([[0.0, 1.0], [1.0, 0.0]], (90, 100))
+"""Part of green light that the filters of a Bayer pattern let through."""
+
+
+def noise(values, size):
+    return np.random.default_rng(int(values.sum())).normal(0, size, values.shape)
+
+
+def said_of_images(tmp_path, capsys, *options, change=np.asarray):
     """Return the line that refuses images as without a mark."""
     for number, values in enumerate(views(Camera(200, 180, pixel_size_m=2.6e-6))):
-        blurred = ndimage.gaussian_filter(values, blur_px)
-        Image.fromarray(blurred).save(tmp_path / f"{number}.png")
+        changed = np.rint(change(values)).astype(np.uint8)
+        Image.fromarray(changed).save(tmp_path / f"{number}.png")
     rows = [f"{number}.png,{x},{y}" for number, (x, y) in enumerate(MOVES)]
     table = tmp_path / "p.csv"
     table.write_text("\n".join(["file,x,y", *rows]) + "\n")

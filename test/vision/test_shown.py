@@ -39,3 +39,15 @@ def test_of_two_spots_that_differ_the_larger_is_stated():
     image[45:49, 45:49] = 40
     found = spots_in(image)
     assert (found.side_px, found.polarity, found.number) == (14.0, "dark", 1)
+
+
+@pytest.mark.parametrize("noise", [1.0, 4.0, 30.0])
+@pytest.mark.parametrize("light", ["even", "slope", "photons"])
+def test_noise_shows_nothing(noise, light):
+    """Its parts are specks, or of all sizes."""
+    rng = np.random.default_rng(3)
+    slope = np.arange(360) / 3 if light == "slope" else np.full(360, 100.0)
+    values = slope + rng.normal(0, noise, (300, 360))
+    if light == "photons":
+        values = rng.poisson(noise / 10, (300, 360))
+    assert spots_in(np.clip(values, 0, 255).astype(np.uint8)) is None

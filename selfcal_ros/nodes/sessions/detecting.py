@@ -9,6 +9,7 @@ from selfcal_ros.nodes.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.units import MS_PER_S
+from selfcal_ros.vision.detector import REMEDIES
 from selfcal_ros.vision.exposures import ImageDetector
 
 MANY_EMPTY = 5
@@ -62,7 +63,7 @@ class DetectingSession:
                 counts.rejected, key=lambda name: counts.rejected[name], default=""
             )
             why = (
-                f", most rejected as {most}"
+                f", most rejected as {most}{f': {REMEDIES[most]}' if most in REMEDIES else ''}"
                 if most
                 else ", nothing looks like one: check mark, mark_size, pixel_size and polarity"
             )

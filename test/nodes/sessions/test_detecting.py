@@ -72,6 +72,10 @@ def test_detections_have_frame_and_stamp_of_their_image(desk):
             "nothing looks like one: check mark, mark_size, pixel_size and polarity",
         ),
         (drawn()[25:], "most rejected as cut_off"),
+        (
+            np.where(drawn() > 100, 255, drawn()),
+            "most rejected as saturated: expose shorter, and take the images again",
+        ),
     ],
 )
 def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values, why):
