@@ -284,17 +284,24 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     assert 0.05 < microscope["share"] < 0.5 and sum(
         line["share"] for line in lines.values()
     ) == pytest.approx(1)
-    assert microscope["removal"]["kind"] == "check_stops"
-    assert microscope["removal"]["effect_rms"] < 0.2 * microscope["effect_rms"]
+    assert microscope["removal"] is None  # of a tenth of u^2
     assert found["U_xy"] == pytest.approx(
         2 * math.hypot(*(line["effect_rms"] for line in lines.values()))
     )
     assert found["U_xy_noise"] == pytest.approx(
         2 * lines["reading noise"]["effect_rms"]
     )
+    assert main([*asked, "--model", "drift:0", "--json"]) == 0
+    of_lines = json.loads(capsys.readouterr().out)["budget"]["lines"]
+    (removal,) = (
+        line["removal"] for line in of_lines if line["component"] == "microscope"
+    )
+    assert removal["kind"] == "check_stops"
+    assert removal["effect_rms"] < 0.2 * microscope["effect_rms"]
+    assert main([*asked, "--model", "drift:0"]) == 0
+    assert "%  add check_stops: {marks: 5, offset: 20e-6}: " in capsys.readouterr().out
     assert main(asked) == 0
     text = capsys.readouterr().out
-    assert "%  add check_stops: {marks: 5, offset: 20e-6}: " in text
     larger = found["U_xy_if_larger"]
     assert 2 * found["U_xy"] < larger < 3 * found["U_xy"]
     assert (

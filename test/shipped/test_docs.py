@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tables of the documentation are complete, and its example runs."""
 
+import json
 import re
 from pathlib import Path
 
@@ -54,6 +55,37 @@ def test_every_verb_explains_itself(verb, capsys):
         main([verb, "--help"])
     assert ended.value.code == 0
     assert f"usage: selfcal {verb}" in capsys.readouterr().out
+
+
+BENT = re.compile(
+    r"\| `(\w+)`[^|]*\| (\d) \| ([\d.]+) / ([\d.]+) µm \| ([\d.]+) µm \| ([\d.]+) / "
+)
+
+
+def test_bent_plates_do_to_the_shipped_plans_what_the_table_states(capsys):
+    guide = (ROOT / "docs/guides/identifiability.md").read_text()
+    rows = BENT.findall(guide)
+    assert [row[0] for row in rows] == [
+        "qiao",
+        "hu_two_shifts",
+        "six_views",
+        "resistant",
+    ]
+    for plan, hidden, rms_um, largest_um, drift_um, gain in rows:
+        path = str(ROOT / f"config/plans/{plan}.yaml")
+        sizes = "plate_shape:30e-9,drift:10e-9"
+        assert main(["plan", "check", path, "--against", sizes, "--json"]) == 0
+        stated = json.loads(capsys.readouterr().out)
+        terms = {term["name"]: term for term in stated["terms"]}
+        bent = terms["plate_shape"]
+        assert bent["unseen_modes"] == int(hidden)
+        assert bent["effect_rms_m"] * 1e6 == pytest.approx(float(rms_um), abs=6e-4)
+        assert bent["effect_max_m"] * 1e6 == pytest.approx(float(largest_um), abs=6e-4)
+        effect_um = terms["drift"]["effect_rms_m"] * 1e6
+        assert effect_um == pytest.approx(float(drift_um), abs=6e-5)
+        assert stated["predicted"]["rms_gain_xy"] == pytest.approx(
+            float(gain), abs=6e-3
+        )
 
 
 METHOD = (ROOT / "docs/theory/method.md").read_text()

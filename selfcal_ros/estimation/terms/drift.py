@@ -63,7 +63,7 @@ BLOCK = Block(
     "m",
     patterns,
     undetected=1e-12,
-    nominal=10e-9,
+    nominal=25e-9,
     needs_visits=True,
     of_time=True,
     alone=lambda component: component.endswith("P1"),

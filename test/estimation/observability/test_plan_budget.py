@@ -209,7 +209,7 @@ def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     assert sizes.count((15, 15)) == 4 and set(sizes) == {(15, 15), (11, 11)}
     before = effects_of_terms(
         plan_of("0, 90, tx", 15),
-        [*default_terms(), ModelTerm("drift", 10e-9)],
+        [*default_terms(), ModelTerm("drift", 25e-9)],
         Assumed(1e-9),
     )
     assert effects(found)["microscope"] == pytest.approx(

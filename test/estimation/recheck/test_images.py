@@ -23,6 +23,7 @@ from selfcal_ros.estimation.recheck.solve import (
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.kept import SlowKept
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.simulation.cell import CellSettings
 from test.estimation.joint.test_images import DISTORTED, MARK, datum, dense
 from test.support.options import bare
@@ -31,6 +32,7 @@ from test.support.truth import Spread, random_truth, simulate_measurements
 
 LINEAR = bare(causes=False, at_places=False, misalignment_model="linear")
 RUNS = 4
+NO_DRIFT = (ModelTerm("drift", 0.0),)
 
 
 def sessions(
@@ -207,8 +209,10 @@ def population(image_m, runs, **settings):
     away, changes, results = [], [], []
     for seed in range(runs):
         later, before, after = sessions(image_m, seed, plate_shape_m=5e-9, **settings)
-        first = calibrate(before, Options(causes=False))
-        result = calibrate(after, Options(plate=first, plate_from="r.json"))
+        first = calibrate(before, Options(causes=False, terms=NO_DRIFT))
+        result = calibrate(
+            after, Options(plate=first, plate_from="r.json", terms=NO_DRIFT)
+        )
         emap, told = result.error_map, result.recheck
         modes = datum_modes(emap.artifact, scale=True)
         away.append(

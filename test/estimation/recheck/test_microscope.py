@@ -160,9 +160,9 @@ def test_a_program_sees_the_exit_code(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     plate = {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 0}
     views = [
-        {"name": "a", "repeats": 2},
-        {"name": "b", "rotation_deg": 90, "repeats": 2},
-        {"name": "c", "translation_pitch": [1, 0], "repeats": 2},
+        {"name": "a", "repeats": 4},
+        {"name": "b", "rotation_deg": 90, "repeats": 4},
+        {"name": "c", "translation_pitch": [1, 0], "repeats": 4},
     ]
     for name, views_of, physics in (
         ("first", views, {}),
@@ -172,7 +172,7 @@ def test_a_program_sees_the_exit_code(tmp_path, monkeypatch, capsys):
             "seed": 3,
             "noise": {"sigma_xy": 2e-8},
             "physics": physics,
-            "cell": {"visit_order": "there_and_back", "stop_sigma": 0.0},
+            "cell": {"visit_order": "x_back_y_back", "stop_sigma": 0.0},
             "plan": {"plan_id": name, "artifact": plate, "views": views_of},
         }
         (tmp_path / f"{name}.yaml").write_text(json.dumps(spec))

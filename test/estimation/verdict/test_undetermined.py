@@ -22,7 +22,7 @@ from test.support.plans import plan_of
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 PLATE = Artifact(9, 0.01, 24)
-DRIFT = ModelTerm("drift", 10e-9)
+DRIFT = ModelTerm("drift", 25e-9)
 
 
 def measured(
@@ -88,7 +88,7 @@ def test_a_drift_that_the_order_hides_is_assumed(sense):
         DRIFT.size,
         "default",
     )
-    assert line_text(line) == "size 0.01 µm, what the readings do not determine of it"
+    assert line_text(line) == "size 0.025 µm, what the readings do not determine of it"
     none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
     added = np.sqrt(u_of(result) ** 2 - u_of(none) ** 2)
     assert line.effect_rms == pytest.approx(rms(added))
