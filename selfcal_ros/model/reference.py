@@ -36,6 +36,10 @@ class ReferenceKind(StrEnum):
         return self in (ReferenceKind.ARTIFACT, ReferenceKind.MARKS)
 
 
+CERTIFIED_WITH = ("expansion_per_k", "u_expansion_per_k", "certified_at_c")
+"""What does not change from one measurement of a certified length to another, beside the length."""
+
+
 @dataclass(frozen=True)
 class Certified:
     """The certificate of a length that was moved to the temperature of the measurement.
@@ -108,6 +112,11 @@ class ReferenceLength:
         if not self.marks:
             return str(self.kind)
         return "distance of the marks {} and {}".format(*self.marks)
+
+    @property
+    def certificate_key(self) -> str:
+        """Letters and digits of the certificate: the same however it is spelled."""
+        return "".join(filter(str.isalnum, self.certificate.casefold()))
 
     @property
     def each(self) -> tuple["ReferenceLength", ...]:

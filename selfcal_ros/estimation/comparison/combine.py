@@ -56,7 +56,7 @@ from selfcal_ros.model.error_map import (
 from selfcal_ros.model.findings import BetweenRuns, EnlargedRuns, Finding, NotInAll
 from selfcal_ros.model.parts import Combined, CombinedRun, Parts
 from selfcal_ros.model.recheck import Significance
-from selfcal_ros.model.reference import ReferenceLength
+from selfcal_ros.model.reference import CERTIFIED_WITH, Certified, ReferenceLength
 from selfcal_ros.model.result import (
     COMBINED,
     ArtifactMap,
@@ -712,6 +712,8 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
             "combine maps that overlap",
         )
     require_own_readings(members, common, scale=not keep_scale)
+    if keep_scale:
+        _require_one_text(members)
     shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known_sites)}
     if lines.sum() > 1:
         angle_rad = 2 * np.pi * np.flatnonzero(lines) / len(lines)
@@ -735,10 +737,38 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
 
 
 def _lengths_of_their_own(members: Sequence[Member]) -> bool:
-    """Return whether each run names another certificate of its length."""
-    references = [member.result.reference for member in members if member.result]
-    names = [reference.certificate for reference in references if reference]
-    return all(names) and len(set(names)) == len(references)
+    """Return whether each run names another certificate of its length, with other numbers."""
+    lengths = [member.result.reference for member in members if member.result]
+    names, numbers = set(), set()
+    for length in filter(None, lengths):
+        stated = length.certified or length
+        names.add(length.certificate_key)
+        numbers.add((stated.relative_error, stated.u_relative))
+    return "" not in names and len(names) == len(numbers) == len(lengths)
+
+
+def _require_one_text(members: Sequence[Member]) -> None:
+    """Refuse runs that state one certificate with different numbers."""
+    first_of: dict[tuple, tuple[str, Certified]] = {}
+    for member in members:
+        length = member.result.reference if member.result else None
+        if length is None or length.certified is None or not length.certificate:
+            continue
+        name, before = first_of.setdefault(
+            (length.certificate_key, length.kind, length.marks),
+            (member.name, length.certified),
+        )
+        for number in ("relative_error", "u_relative", *CERTIFIED_WITH):
+            value, value_before = (
+                getattr(certified, number) for certified in (length.certified, before)
+            )
+            if not np.isclose(value, value_before, rtol=1e-9, atol=0.0):
+                raise InputError(
+                    member.name,
+                    f"{number} of the certificate '{length.certificate}' is {value:g}, and "
+                    f"{value_before:g} in {name}",
+                    "solve again with what it states; if it has several lengths, name them apart",
+                )
 
 
 def _checked(members: Sequence[Member], *, keep_scale: bool) -> CalibrationResult:

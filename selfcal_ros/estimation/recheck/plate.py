@@ -36,7 +36,7 @@ from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.findings import Finding, OtherPlate
 from selfcal_ros.model.pose import EDGE, PlacedPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.reference import ReferenceLength
+from selfcal_ros.model.reference import CERTIFIED_WITH, ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import MM_PER_M
 
@@ -171,7 +171,7 @@ def reference_now(
     now = replace(
         before, relative_error=certified.relative_error, u_relative=certified.u_relative
     ).at_temperature(at)
-    for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
+    for name in CERTIFIED_WITH:
         value_now = getattr(now.certified, name)
         certified_value = getattr(certified, name)
         if not np.isclose(value_now, certified_value, rtol=1e-9, atol=0.0):

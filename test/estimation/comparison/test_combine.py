@@ -538,6 +538,37 @@ def test_lengths_of_different_certificates_explain_that_magnifications_differ():
     assert all(run.agrees for run in found.result.parts.combined.runs)
 
 
+def certified_as(result, name, error, at):
+    length = ReferenceLength("artifact", error, 2e-6, name).at_temperature(at)
+    return replace(result, reference=length)
+
+
+def test_one_certificate_is_one_length_however_it_is_spelled():
+    """Its u, 2 µm/m, does not average out; runs that state it with other numbers are refused."""
+    at = "20.4:0:5e-7:0"
+    spelled = [
+        part(name, certified_as(result, name, 1e-5, at))
+        for name, result in (("PTB 5.2-0815", A), ("ptb 5.2 0815 ", B))
+    ]
+    other = part("c", certified_as(C, "DKD 7", 1e-5, at))
+    place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()]) * 2e-6
+    for runs in (spelled, [spelled[0], other]):
+        common = combine(runs, keep_scale=True).xy.common
+        np.testing.assert_allclose(common, place**2, rtol=1e-3, atol=1e-22)
+    for error, at_other, stated in (
+        (
+            1.2e-5,
+            at,
+            "relative_error of the certificate 'PTB 5.2-0815' is 1.2e-05, and 1e-05",
+        ),
+        (1e-5, "21:0:8e-6:0", "expansion_per_k .* is 8e-06, and 5e-07 in PTB 5.2-0815"),
+    ):
+        wrong = part("c", certified_as(C, "PTB 5.2-0815", error, at_other))
+        with pytest.raises(InputError, match=f"c: {stated}"):
+            combine([*spelled, wrong], keep_scale=True)
+        assert combine([*spelled, wrong]).result.reference is None
+
+
 def test_magnifications_that_differ_have_one_degree_of_freedom():
     """Two runs whose scales are 10 µm/m apart, as of a stage that was 1 K warmer: U covers both.
 
