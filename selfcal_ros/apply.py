@@ -25,7 +25,7 @@ from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.results import read_result
 
-MOST_NODES = 15
+MOST_NODES = 25
 """Nodes along a side between which distances are judged."""
 MAX_POINTS = 2000
 """Largest number of points of a covariance matrix: 128 MB."""
@@ -325,10 +325,15 @@ class StageMap(Compensator):
         )
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
+        at, which = np.unique(
+            np.rint(length / length.max() / SNAP), return_inverse=True
+        )
+        most = np.zeros(len(at))  # of each length the largest U
+        np.maximum.at(most, which, U / size)
         solution = linprog(
             [1.0, (length / length.max()).mean()],
-            b_ub=-U / size,
-            A_ub=-np.stack([np.ones(len(U)), length / length.max()], axis=1),
+            b_ub=-most,
+            A_ub=-np.stack([np.ones(len(at)), SNAP * at], axis=1),
         )
         return float(solution.x[0] * size), float(solution.x[1] * size / length.max())
 
@@ -341,7 +346,10 @@ class StageMap(Compensator):
         if not between:
             step = -(-max(plate.shape) // MOST_NODES)
             some = np.zeros(plate.shape, dtype=bool)
-            some[::step, ::step] = True
+            rows, columns = (
+                {*range(0, count, step), count - 1} for count in plate.shape
+            )
+            some[np.ix_(sorted(rows), sorted(columns))] = True
             some &= self.error_map.valid
             return plate.x_m[some], plate.y_m[some]
         sides = []

@@ -395,6 +395,19 @@ def test_u_of_distances_is_a_bound_of_all_pairs_that_one_of_them_meets(monkeypat
     assert slack.min() == pytest.approx(0, abs=1e-13)
 
 
+@pytest.mark.parametrize(("size", "node", "anywhere"), [(9, 10, True), (26, -1, False)])
+def test_the_line_covers_the_distances_of_the_worst_node(
+    monkeypatch, size, node, anywhere
+):
+    """Beside a corner, and the corner of an even field: both were passed over."""
+    variance = np.full((2, size**2), 1e-18)
+    variance[:, node] = 1e-16
+    stage = stage_of(Artifact(size, 0.01), np.diag(variance.ravel()), monkeypatch)
+    a, b = stage.length_uncertainty(anywhere=anywhere)
+    U = stage.result.noise.k_xy * np.sqrt(101e-18)
+    assert a + b * 0.01 >= U * (1 - 1e-9)
+
+
 def test_a_distance_anywhere_has_the_interpolation_of_its_own_direction(monkeypatch):
     """Gx is 8 nm off halfway, Gy nothing: along y the distance is as between nodes."""
     plate = Artifact(3, 0.01, 0, 3)
