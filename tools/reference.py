@@ -161,7 +161,8 @@ SOMETIMES = {
     "times the square of the half width, for unit noise",
     "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "
     "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
-    "(_theta; agrees is null, and agrees_theta left out, where there is no noise to test it by)",
+    "(_theta; agrees is null, and agrees_theta left out, where there is no noise to test it by), "
+    "calibration (of a recheck: as in recheck)",
     "map_covariance": "covariance of a mean map or a recheck up to 21 × 21 sites, lower "
     "triangles over Gx, then Gy, of the known sites (`xy`) and over the known lines "
     "(`theta`), in units of scale_xy (m²), scale_theta (rad²)",

@@ -106,13 +106,18 @@ def _text(result: CalibrationResult) -> str:
         lines.append(
             f"  {run.file}: weight {run.weight:.3f}, |E_n| rms "
             f"{run.e_n_rms:.2f}, largest {run.e_n_largest:.2f}, beyond 1 at "
-            f"{100 * run.beyond:.1f} %{_p(run.p)}{_run_text(run)}"
+            f"{100 * run.beyond:.1f} %{_p(run)}{_run_text(run)}"
         )
     return "\n".join([*lines, *(f"warning: {line}" for line in result.warnings)])
 
 
-def _p(p: float) -> str:
-    return "" if math.isnan(p) else f", {p_text(p)}"
+def _p(run: CombinedRun) -> str:
+    of_kinds = (run.p, ""), (run.p_theta, " in theta")
+    return "".join(
+        f", {p_text(p)}{where}"
+        for p, where in of_kinds
+        if p is not None and not math.isnan(p)
+    )
 
 
 def _run_text(run: CombinedRun) -> str:

@@ -340,6 +340,14 @@ class NotInAll(Finding):
     sites: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class WarningOfRuns(Finding):
+    """A warning of combined `runs`, by their files, in words."""
+
+    runs: tuple[str, ...]
+    warning: str
+
+
 class NoUncertainty(Finding):
     """The field is too large for an uncertainty that nobody asked for."""
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.model.findings import SlipBefore, SlipFound
+from selfcal_ros.model.recheck import PlateCalibration
 from selfcal_ros.outputs import filled_fields
 
 
@@ -234,6 +235,8 @@ class CombinedRun:
         Whether it scatters more than the others.
     e_n_rms_theta, ... : optional
         The same of the angular map.
+    calibration : PlateCalibration, optional
+        Of a recheck: what made its plate known.
     """
 
     file: str
@@ -252,6 +255,7 @@ class CombinedRun:
     p_theta: float | None = None
     agrees_theta: bool | None = None
     stands_out_theta: bool | None = None
+    calibration: PlateCalibration | None = None
 
 
 @dataclass(frozen=True)

@@ -359,12 +359,11 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
         )
     yield from _views(result)
     for kind, name in (("xy", "x and y"), ("theta", "theta")):
-        if np.isfinite(k := getattr(noise, f"k_{kind}")):
+        if np.isfinite(result.error_map.of(kind)[1]).any():
+            k, dof = getattr(noise, f"k_{kind}"), dof_text(noise.dof_of(kind))
             yield (
                 f"coverage of {name}",
-                (
-                    f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))} degrees of freedom"
-                ),
+                f"k = {k:.3g} for 95.45 %, {dof} degrees of freedom",
             )
     for warning in result.warnings:
         yield "warning", warning

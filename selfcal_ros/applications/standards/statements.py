@@ -9,6 +9,7 @@ from typing import Any
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.findings import ScaleNotCompared
+from selfcal_ros.model.recheck import PlateCalibration
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import UM_PER_M
 
@@ -68,32 +69,36 @@ def _require_temperature(
 ) -> None:
     """Refuse a temperature of the plate that contradicts the one of its reference length.
 
-    It may differ between the runs of a mean.
+    Of a mean, it is one of the temperatures of its runs, or between them.
     """
-    length = result.reference
-    if (
-        length is None
-        or length.certified is None
-        or length.runs
-        or not length.kind.of_plate
-    ):
+    lengths = result.reference.each if result.reference else ()
+    of_plate = [
+        length.certified
+        for length in lengths
+        if length.certified and length.kind.of_plate
+    ]
+    if not of_plate or len(of_plate) < len(lengths):
         return
-    used, u = length.certified.temperature_c, length.certified.u_temperature_k
+    coldest, warmest = (
+        choice(of_plate, key=lambda certified: certified.temperature_c)
+        for choice in (min, max)
+    )
     for item in conditions:
-        if (
-            item.get("unit") == "degC"
-            and "plate" in item["name"]
-            and (
-                abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9
-            )
+        if item.get("unit") != "degC" or "plate" not in item["name"]:
+            continue
+        value, u = item["value"], item.get("u", 0.0)
+        for used, beyond in (
+            (coldest, coldest.temperature_c - value),
+            (warmest, value - warmest.temperature_c),
         ):
-            raise InputError(
-                "certificate",
-                f"{item['name']} is {item['value']:g} °C, but the reference length "
-                f"was converted to {used:g} °C (u {u:g} K)",
-                "correct the condition, or solve again with the temperature of the "
-                "measurement in --reference-at",
-            )
+            if beyond > 2 * math.hypot(used.u_temperature_k, u) + 1e-9:
+                raise InputError(
+                    "certificate",
+                    f"{item['name']} is {value:g} °C, but the reference length was converted "
+                    f"to {used.temperature_c:g} °C (u {used.u_temperature_k:g} K)",
+                    "correct the condition, or solve again with the temperature of the "
+                    "measurement in --reference-at",
+                )
 
 
 def is_traceable(result: CalibrationResult) -> bool:
@@ -123,16 +128,39 @@ def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]
 
 def method_name(result: CalibrationResult) -> str:
     """Return the name of the method."""
-    if result.recheck is not None:
-        return "Comparison of a stage with a plate known from its calibration"
-    return "Self-calibration of a stage with a plate in several views"
+    of_plate, of_views = (
+        "Comparison of a stage with a plate known from its calibration",
+        "Self-calibration of a stage with a plate in several views",
+    )
+    mean = result.parts.combined
+    if mean is None:
+        return of_views if result.recheck is None else of_plate
+    methods = {
+        of_plate
+        if run.calibration
+        else of_views
+        if run.sha256 or run.run_id
+        else "Error map from another source"
+        for run in mean.runs
+    }
+    return f"Weighted mean of {len(mean.runs)} maps: {'; '.join(sorted(methods))}"
 
 
 def known_plate_texts(result: CalibrationResult) -> list[str]:
-    """Return which calibration made the plate of a recheck known; nothing of other results."""
-    if result.recheck is None:
-        return []
-    calibration = result.recheck.calibration
+    """Return which calibrations made the plates of rechecks known; nothing of other results."""
+    if result.recheck is not None:
+        return [
+            f"{_known_from(result.recheck.calibration)}; their uncertainty is the line 'known "
+            "plate' of the budget"
+        ]
+    runs = result.parts.combined.runs if result.parts.combined else ()
+    return [
+        f"{run.file}: {_known_from(run.calibration)}" for run in runs if run.calibration
+    ]
+
+
+def _known_from(calibration: PlateCalibration) -> str:
+    """Return which calibration the errors of the marks are from."""
     readings = calibration.readings
     dates = [
         instant[:10]
@@ -150,10 +178,9 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
         ),
         *([f"evaluated {calibration.created}"] if calibration.created else []),
     ]
-    return [
-        f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
-        "uncertainty is the line 'known plate' of the budget"
-    ]
+    return (
+        f"the errors of the marks are those of a self-calibration ({'; '.join(facts)})"
+    )
 
 
 def scale_texts(result: CalibrationResult) -> list[str]:
@@ -176,6 +203,11 @@ def scale_texts(result: CalibrationResult) -> list[str]:
             "The scale is that of the known plate, set at its calibration and converted "
             "to the temperature of this measurement as follows."
         )
+    mean = result.parts.combined
+    if mean is not None:
+        texts.append(
+            "The scale is the mean of those of the runs, by their weights, each set as follows."
+        )
     for length in result.reference.each:
         texts.append(
             f"The scale is set by a reference length ({length.name}): relative "
@@ -193,7 +225,8 @@ def scale_texts(result: CalibrationResult) -> list[str]:
     if not is_traceable(result):
         texts.append(
             "Not traceable: this needs a certificate, its uncertainty, and the "
-            "temperature of the reference (--certificate, --reference-at)."
+            "temperature of the reference (--certificate, --reference-at)"
+            + (", of every run." if mean else ".")
         )
     return texts
 

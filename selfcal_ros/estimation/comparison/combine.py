@@ -7,7 +7,7 @@ the part between runs. Its covariance T has one variance for each given shape, a
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -53,7 +53,13 @@ from selfcal_ros.model.error_map import (
     datum_columns,
     rms,
 )
-from selfcal_ros.model.findings import BetweenRuns, EnlargedRuns, Finding, NotInAll
+from selfcal_ros.model.findings import (
+    BetweenRuns,
+    EnlargedRuns,
+    Finding,
+    NotInAll,
+    WarningOfRuns,
+)
 from selfcal_ros.model.parts import Combined, CombinedRun, Parts
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.reference import CERTIFIED_WITH, Certified, ReferenceLength
@@ -1017,12 +1023,26 @@ def _result(
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
         provenance=of_all_runs(runs),
-        findings=(NotInAll(sites=int((~known_sites).sum())),)
-        if not known_sites.all()
-        else (),
+        findings=(*_not_in_all(known_sites), *_warnings(members)),
         placed_plate=first.placed_plate,
     )
     return replace(result, budget=_budget(result, means))
+
+
+def _not_in_all(known_sites: np.ndarray) -> Iterator[NotInAll]:
+    """Yield how many sites of the mean are unknown, if some are."""
+    if not known_sites.all():
+        yield NotInAll(sites=int((~known_sites).sum()))
+
+
+def _warnings(members: Sequence[Member]) -> Iterator[WarningOfRuns]:
+    """Yield each warning of the runs once, with the files that have it."""
+    runs_of: dict[str, list[str]] = defaultdict(list)
+    for member in members:
+        for warning in member.result.warnings if member.result else ():
+            runs_of[warning].append(member.name)
+    for warning, runs in runs_of.items():
+        yield WarningOfRuns(runs=tuple(runs), warning=warning)
 
 
 def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> Combined:
@@ -1040,12 +1060,15 @@ def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> Combined:
             deviations |= _of_run(
                 mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(members)
             )
+        result = member.result
+        recheck = None if result is None else result.recheck
         runs.append(
             CombinedRun(
                 file=member.name,
-                run_id=member.result.run_id if member.result else "",
-                sha256=member.result.input.get("sha256", "") if member.result else "",
+                run_id=result.run_id if result else "",
+                sha256=result.input.get("sha256", "") if result else "",
                 weight=float(means["xy"].weights[index]),
+                calibration=None if recheck is None else recheck.calibration,
                 **deviations,
             )
         )
@@ -1153,29 +1176,23 @@ def _budget(
     lines: list[BudgetLine] = []
     between = [line for line in budget_lines(result) if line.component == INTERPOLATION]
     for kind, mean in means.items():
-        for component, variance, size, letter, dof in (
-            (
-                "uncertainty of the runs",
-                mean.within,
-                rms(np.sqrt(mean.within)),
-                "A",
-                mean.dof,
-            ),
-            ("shared by all runs", mean.common, rms(np.sqrt(mean.common)), "B", np.inf),
-            ("between runs", mean.between, mean.u_between, "A", mean.dof),
+        for component, variance, size, is_scatter in (
+            ("uncertainty of the runs", mean.within, None, True),
+            ("shared by all runs", mean.common, None, False),
+            ("between runs", mean.between, mean.u_between, True),
         ):
             u = np.sqrt(variance)
             lines.append(
                 BudgetLine(
                     quantity=kind,
                     component=component,
-                    kind=letter,
-                    u=size,
+                    kind="A" if is_scatter else "B",
+                    u=rms(u) if size is None else size,
                     unit=KINDS[kind],
                     effect_rms=rms(u),
                     effect_max=float(u.max()),
-                    dof=dof,
-                    source="readings",
+                    dof=mean.dof if is_scatter else np.inf,
+                    source="readings" if is_scatter else "declared",
                     details=OfRuns(len(mean.weights)),
                 )
             )

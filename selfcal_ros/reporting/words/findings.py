@@ -11,7 +11,7 @@ from functools import singledispatch
 from typing import Any
 
 from selfcal_ros.blocks import blocks
-from selfcal_ros.errors import some_of
+from selfcal_ros.errors import printable, some_of
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
 from selfcal_ros.model.budget import BudgetLine, OfAssumption, OfTerm
 from selfcal_ros.model.findings import (
@@ -55,7 +55,9 @@ from selfcal_ros.model.findings import (
     TooManyOutliers,
     Unchecked,
     VisitedOnce,
+    WarningOfRuns,
 )
+from selfcal_ros.model.parts import Combined
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -426,6 +428,11 @@ def _(finding: NotInAll) -> str:
 
 
 @sentence_of.register
+def _(finding: WarningOfRuns) -> str:
+    return f"{', '.join(map(printable, finding.runs))}: {finding.warning}"
+
+
+@sentence_of.register
 def _(finding: TermWithoutReadings) -> str:
     return f"no reading depends on {finding.term}: it is not in the model; leave it out"
 
@@ -657,9 +664,7 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     if assumed:
         verdict = replace(verdict, sentence=f"{verdict.sentence}; {assumed}")
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
-        verdict = replace(
-            verdict, sentence="Good: the runs agree within their uncertainties"
-        )
+        verdict = replace(verdict, sentence=_agreement(result.parts.combined))
     if result.recheck is not None and verdict.qualified:
         sentence = phrases.recheck_sentence(
             result.recheck,
@@ -677,6 +682,22 @@ def worded(result: CalibrationResult) -> CalibrationResult:
         budget=tuple(
             replace(line, text=line.text or line_text(line)) for line in result.budget
         ),
+    )
+
+
+def _agreement(mean: Combined | None) -> str:
+    """Return the sentence of a mean whose runs scatter no more than by chance."""
+    disagree = [
+        printable(run.file)
+        for run in (mean.runs if mean else ())
+        if False in (run.agrees, run.agrees_theta)
+    ]
+    if not disagree:
+        return "Good: the runs agree within their uncertainties"
+    return (
+        "Good: the runs scatter no more than by chance, though "
+        f"{' and '.join(disagree)} {'disagrees' if len(disagree) == 1 else 'disagree'} with the "
+        "others at 5 %"
     )
 
 

@@ -551,9 +551,9 @@ def test_the_largest_u_of_the_budget_is_that_of_the_worst_node():
         assert said == pytest.approx(u, rel=5e-3) if name != "anywhere" else said > u
 
 
-def run(seed, reference=None):
+def run(seed, reference=None, *, lines=8):
     rng = np.random.default_rng(1)
-    plan = hu_plan(Artifact(5, 0.01, 8), 2)
+    plan = hu_plan(Artifact(5, 0.01, lines), 2)
     truth = random_truth(plan.artifact, len(plan.views), rng)
     readings = simulate_measurements(
         truth, plan, np.random.default_rng(seed), sigma_m=2e-8, sigma_theta_rad=2e-5
@@ -594,6 +594,40 @@ def test_a_mean_is_traceable_if_all_its_runs_are():
         assert is_traceable(result_from_dict(result_to_dict(mean), "m")) is traceable
     table = Member("t.csv", run(7).error_map)
     assert not is_traceable(combine([run(5, cold), table], keep_scale=True).result)
+
+
+@pytest.mark.parametrize(
+    ("value", "beyond"), [(20.2, ""), (20.7, ""), (20.0, "20.4"), (21.4, "21")]
+)
+def test_a_temperature_beyond_those_of_the_runs_of_a_mean_is_refused(value, beyond):
+    cold, warm = (CERTIFIED.at_temperature(f"{t}:.1:5e-7:5e-8") for t in (20.4, 21))
+    mean = worded(combine([run(5, cold), run(6, warm)], keep_scale=True).result)
+    stated = {"name": "plate", "value": value, "u": 0.05, "unit": "degC"}
+    given = {**details(), "conditions": [stated]}
+    if not beyond:
+        assert certificate(mean, given)
+        return
+    with pytest.raises(InputError, match=f"length was converted to {beyond} °C"):
+        certificate(mean, given)
+
+
+def test_the_certificate_of_a_mean_states_what_its_runs_are():
+    """One calibration, one recheck, and a table, of plates without lines."""
+    _, again = rechecked()
+    parts = [run(5, lines=0), Member("again.json", again.error_map, again)]
+    parts[0] = replace(parts[0], result=replace(parts[0].result, run_id="17"))
+    parts.append(Member("t.csv", run(7, lines=0).error_map))
+    root = written(worded(combine(parts).result))
+    [method] = root.iter(f"{{{DCC}}}usedMethod")
+    text = " ".join(method.itertext())
+    assert "Weighted mean of 3 maps: Comparison of a stage" in text
+    assert "; Error map from another source; Self-calibration of a stage" in text
+    assert "again.json: the errors of the marks are those of a self-calibration" in text
+    assert named(root, "coverage of x and y") and not named(root, "coverage of theta")
+    scale = " ".join(statement(root, "Metrological traceability").itertext())
+    assert "the magnification of each run was removed from the mean" in scale
+    [shared] = named(root, "shared by all runs (type B)")[:1]
+    assert ", declared: declared or assumed" in " ".join(shared.itertext())
 
 
 def test_a_mean_has_u_of_its_squareness():

@@ -543,6 +543,37 @@ def certified_as(result, name, error, at):
     return replace(result, reference=length)
 
 
+def test_warnings_of_runs_are_those_of_their_mean():
+    """Once each, with the files; a mean had none."""
+    runs = [
+        part(name, replace(result, warnings=warnings))
+        for name, result, warnings in (
+            ("a", A, ("the clock stepped", "backlash")),
+            ("b", B, ("backlash",)),
+            ("c", C, ()),
+        )
+    ]
+    mean = worded(combine(runs).result)
+    assert mean.warnings == ("a: the clock stepped", "a, b: backlash")
+    read = worded(result_from_dict(plain(result_to_dict(mean)), "mean"))
+    assert read.warnings == mean.warnings
+
+
+def test_a_run_that_disagrees_is_named_where_the_scatter_is_chance():
+    found = combine([part("a", A), part("b", B)]).result
+    for agrees, text in (
+        ((True, None), "Good: the runs agree within their uncertainties"),
+        ((False, True), "though a disagrees with the others at 5 %"),
+    ):
+        runs = list(found.parts.combined.runs)
+        runs[0] = replace(runs[0], agrees=agrees[0], agrees_theta=agrees[1])
+        parts = replace(
+            found.parts, combined=replace(found.parts.combined, runs=tuple(runs))
+        )
+        sentence = worded(replace(found, parts=parts)).verdict.sentence
+        assert sentence.endswith(text)
+
+
 def test_one_certificate_is_one_length_however_it_is_spelled():
     """Its u, 2 µm/m, does not average out; runs that state it with other numbers are refused."""
     at = "20.4:0:5e-7:0"
