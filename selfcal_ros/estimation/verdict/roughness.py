@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import (
@@ -331,6 +332,13 @@ def _datum_of(places_m: np.ndarray) -> Gauge:
     )
 
 
+def _between(rows: np.ndarray, matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return rows^T matrix columns, of real parts and imaginary ones, (2 p, 2 q)."""
+    n = len(rows)
+    blocks = rows.T @ matrix.reshape(2, n, 2, n).swapaxes(1, 2) @ columns
+    return blocks.swapaxes(1, 2).reshape(2 * rows.shape[1], -1)
+
+
 @dataclass(frozen=True, eq=False)
 class _Further:
     """Information on the coefficients e by which a refined map differs from a coarse one.
@@ -367,37 +375,31 @@ class _Further:
         elimination = coupling @ within
         normal = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
         normal -= elimination @ coupling.T
-        right = np.concatenate([b.real, b.imag]) - elimination @ d
+        right = np.stack([b.real, b.imag]) - (elimination @ d).reshape(2, -1)
         contained = nodes.within(spline)
-        further = (
-            np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
-        )
-        coarse_basis, further_basis = (
-            np.kron(np.eye(2), basis) for basis in (contained, further)
-        )
+        # Z = 0 of what the coarse map contains: e along the other directions alone
+        directions = qr(contained)[0][:, contained.shape[1] :]
+        at_nodes = spline.rows(nodes.places_m.ravel()) @ directions
+        further = directions - contained @ at_nodes
         inverse = np.linalg.pinv(
-            coarse_basis.T @ normal @ coarse_basis, hermitian=True, rcond=GAP
+            _between(contained, normal, contained), hermitian=True, rcond=GAP
         )
-        answer = inverse @ (coarse_basis.T @ normal)
-        projected = further_basis.T @ (normal - normal @ coarse_basis @ answer)
-        eigenvalues, vectors = np.linalg.eigh(projected @ further_basis)
-        coefficient_errors = (
-            coarse_basis @ (answer @ further_basis) - further_basis
-        ) @ vectors
-        scalar = np.asarray(
-            spline.rows(places_m) @ np.hstack(np.split(coefficient_errors, 2))
+        both = _between(contained, normal, further)
+        answer = inverse @ both
+        eigenvalues, vectors = np.linalg.eigh(
+            _between(further, normal, further) - both.T @ answer
         )
-        field = (
-            scalar[:, : coefficient_errors.shape[1]]
-            + 1j * scalar[:, coefficient_errors.shape[1] :]
+        on_places = spline.rows(places_m)
+        real, imaginary = np.hsplit(
+            (on_places @ contained) @ np.hstack(np.split(answer @ vectors, 2))
+            - (on_places @ further) @ np.hstack(np.split(vectors, 2)),
+            2,
         )
-        field = _datum_of(places_m).without(field)
-        right_of_further = right - normal @ coarse_basis @ (
-            inverse @ (coarse_basis.T @ right)
-        )
+        field = _datum_of(places_m).without(real + 1j * imaginary)
+        of_further = (right @ further).ravel() - answer.T @ (right @ contained).ravel()
         return cls(
             np.maximum(eigenvalues, 0.0),
-            vectors.T @ (further_basis.T @ right_of_further),
+            vectors.T @ of_further,
             np.concatenate([field.real, field.imag]),
         )
 
