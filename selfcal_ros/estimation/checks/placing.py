@@ -51,6 +51,8 @@ ROUGHER = (1 / 2, 1 / 4)
 plates that lie as planned contradict each other then, too."""
 LEFT = 0.05
 """Part of the plan's mean square which another pose may leave: there may be other faults too."""
+STEPS = (-2, -1, 1, 2)
+"""Steps along a row of marks by which a plate is tried beside its place."""
 SAME_MARK = 0.1
 """Distance, in pitches, within which a mark at another pose lies on a mark of a list."""
 ON_MARKS = 0.8
@@ -244,10 +246,8 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
         (-a, -b),
         (b, a),
         (-b, -a),
-        (a + 1, b),
-        (a - 1, b),
-        (a, b + 1),
-        (a, b - 1),
+        *((a + step, b) for step in STEPS),
+        *((a, b + step) for step in STEPS),
     }
     yield from (replace(pose, shift=shift) for shift in sorted(shifts - {pose.shift}))
 

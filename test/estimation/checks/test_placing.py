@@ -251,8 +251,8 @@ def test_other_poses_are_turns_and_shifts_each_once():
         (0, (0, 1)),
         (0, (0, -1)),
         (0, (2, 0)),
-        (0, (1, 1)),
-        (0, (1, -1)),
+        (0, (3, 0)),
+        *((0, (1, step)) for step in (-2, -1, 1, 2)),
     } == set(poses)
 
 
