@@ -31,6 +31,8 @@ from selfcal_ros.collection.marks.seen_poses import (
     texts,
 )
 from selfcal_ros.collection.marks.stops import places_of_cells
+from selfcal_ros.collection.reduce import displacement_seen
+from selfcal_ros.estimation.checks.placing import Misplaced
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -142,6 +144,8 @@ class DetectionsSeen:
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
+        if rejected.keys() & set(PLACED):
+            poses |= self._unnamed(views, marks)
         faults = texts(poses)
         joints = not any(pose.planned for pose in poses.values())
         session = self._evidence(
@@ -183,6 +187,32 @@ class DetectionsSeen:
         )
         views_lie_wrong = bool(faults.keys() & named.keys())
         return named if views_lie_wrong and not all_alike else {None: finding}
+
+    def _unnamed(
+        self, views: Mapping[int, ViewReadings], marks: Mapping[int, NamedMarks]
+    ) -> dict[int, SeenPose]:
+        """Return view_index -> where images without ids show the plate, of views that show it."""
+        poses = {}
+        for index, readings in views.items():
+            view = readings.view
+            if view.image is None or not view.grid or index in marks:
+                continue
+            table = self.table[self.view_of == index]
+            shift = displacement_seen(
+                self.artifact, view, table, self.exposures, self.rules, self.sense
+            )
+            if shift is None:
+                continue
+            pose = view.on_stage(self.artifact)
+            x, y = pose.shift
+            lies = (round(x + shift.real, 1), round(y + shift.imag, 1))
+            poses[index] = SeenPose(
+                replace(Misplaced.of(view.name, pose, pose), found_shift=lies),
+                planned=not shift,
+                mirrored=False,
+                named=False,
+            )
+        return poses
 
     def _lag(self, views: Mapping[int, ViewReadings]) -> Lag | None:
         """Return when the stage rests at the marks, if not at the stamps of detections."""

@@ -382,15 +382,76 @@ def displacement(
     artifact: Artifact, view: View, rigid: Rigid, reading_m: np.ndarray
 ) -> complex:
     """Return by how many whole pitches marks without ids lie beside the plate, stage frame."""
+    rows = _rows_at(artifact, view, rigid, reading_m)
+    return _on_stage(artifact, view, map(stops.middle_of, rows, artifact.shape))
+
+
+def displacement_seen(
+    artifact: Artifact,
+    view: View,
+    detections: np.ndarray,
+    exposures: Exposures,
+    rules: identify.IdentityRules,
+    sense: Sense,
+) -> complex | None:
+    """Return by how many pitches images without ids show the plate beside its place, stage frame.
+
+    Of several places that where the images lack the fewest marks; None if marks are seen beside
+    the plate at each.
+    """
+    grid = detections[detections["kind"] == Kind.GRID]
+    stage = exposures.at(grid["stamp"])
+    usable = (stage.x.code == GOOD) & (stage.y.code == GOOD)
+    position = np.stack([stage.x.position, stage.y.position])[:, usable]
+    grid = grid[usable]
+    if not len(grid):
+        return None
+    reading = _reading(sense, position, np.stack([grid["offset_x"], grid["offset_y"]]))
+    rigid = identify.identify_grid(
+        artifact,
+        view,
+        reading,
+        ids=np.zeros(reading.shape, dtype=np.int64),
+        has_id=np.zeros(len(grid), dtype=bool),
+        rules=rules,
+    ).rigid
+    rows = _rows_at(artifact, view, rigid, reading)
+    stage_rows = _rows_at(artifact, view, rigid, _reading(sense, position, 0.0))
+    steps = [cell.step_on_plate(artifact) for cell in view.sub_views]
+    middles = []
+    for row, side, stage_row, step in zip(
+        rows, artifact.shape, stage_rows, zip(*steps, strict=True), strict=True
+    ):
+        visible = int(stage_row.min()) + min(step), int(stage_row.max()) + max(step)
+        middle = stops.middle_of(row, side, visible=visible)
+        first = middle - side // 2
+        beside = (row < first) | (row >= first + side)
+        if 4 * side * beside.sum() > len(row):
+            return None
+        middles.append(middle)
+    whole = _on_stage(artifact, view, middles)
+    part = complex(rigid.tx_m, rigid.ty_m) / artifact.grid_pitch_m
+    return whole + (part if whole and abs(part) > NEARLY_WHOLE else 0)
+
+
+NEARLY_WHOLE = 0.25
+"""Part of a pitch up to which a plate is said to lie at a whole one."""
+
+
+def _rows_at(
+    artifact: Artifact, view: View, rigid: Rigid, places_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return m and n of the marks, of a lattice without an edge, at places (2, n) on the stage."""
     pose = view.on_stage(artifact)
     pitch = artifact.grid_pitch_m
-    centred = reading_m - np.array(pose.shift)[:, None] * pitch
-    on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
-    pitches_off = (
-        stops.middle_of(row, side)
-        for row, side in zip(on_plate, artifact.shape, strict=True)
-    )
-    x, y = pose.turned(*(np.array([float(number)]) for number in pitches_off))
+    centred = places_m - np.array(pose.shift)[:, None] * pitch
+    return artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
+
+
+def _on_stage(artifact: Artifact, view: View, steps: Iterable[int]) -> complex:
+    """Return steps along m and n as x + iy in the stage frame."""
+    columns = (np.array([float(step)]) for step in steps)
+    x, y = view.on_stage(artifact).turned(*columns)
     return complex(x[0], y[0])
 
 

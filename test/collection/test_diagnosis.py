@@ -20,7 +20,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import START_NS, gathered, scene
-from test.support.plans import placed_plan, plan_of
+from test.support.misplaced import photographed
+from test.support.plans import image_plan, placed_plan, plan_of
 from test.support.truth import random_truth
 
 S = 1_000_000_000
@@ -272,6 +273,53 @@ def test_offsets_that_are_no_numbers_do_not_hide_the_ids_of_a_view(value):
         cell.spoil(index, offset_x=value)
     found = findings(cell.events)
     assert list(found) == [1] and "the ids have m and n exchanged" in found[1]
+
+
+@pytest.mark.parametrize(
+    ("lies", "size", "said"),
+    [
+        ({1: 1}, 7, "(+1, +0) pitches, not by (+0, +0)"),
+        ({0: -1j}, 7, "(+0, -1) pitches, not by (+0, +0)"),
+        ({1: 1 - 1j}, 6, "(+1, -1) pitches, not by (+0, +0)"),
+        ({2: -1}, 7, "(+0, +0) pitches, not by (+1, +0)"),
+        # that it lies by one more along x shows a row that no image shows
+        ({2: 1 + 1j}, 7, "(+2, +1) pitches, not by (+1, +0)"),
+        ({1: 0.7}, 7, "(+0.7, +0) pitches, not by (+0, +0)"),
+        ({}, 7, ""),
+        ({}, 6, ""),
+    ],
+)
+def test_images_without_ids_show_by_how_many_pitches_a_plate_lies_beside_its_place(
+    lies, size, said
+):
+    found = findings(photographed(in_images(size), lies).events)
+    assert list(found) == list(lies)
+    for line in found.values():
+        assert f"the plate lies shifted by {said} pitches; shift it as planned" in line
+        assert (
+            "leave the joints and the sense as they are" in line and "ids" not in line
+        )
+
+
+def test_plates_that_lie_beside_their_places_in_all_views_do_not_clear_the_joints():
+    found = findings(photographed(in_images(7), dict.fromkeys(range(3), 1)).events)
+    assert "by (+1, +0) pitches, not by (+0, +0)" in found[0]
+    assert not any("leave the joints" in line for line in found.values())
+
+
+@pytest.mark.parametrize(
+    "change", [lambda x, y: (y, x), lambda x, y: (-x, y), lambda x, y: (-x, -y)]
+)
+def test_images_of_wrong_joints_show_no_plate_beside_its_place(change):
+    cell = photographed(in_images(7), {})
+    assert "shifted" not in " ".join(findings(with_positions(cell, change)).values())
+
+
+def in_images(size):
+    """Return a cell of which each image shows nine marks, the last view shifted by a pitch."""
+    plan = image_plan(size, turns=(0, 90, 180))
+    shifted = replace(plan.views[0], name="tx", translation_m=(1e-3, 0.0))
+    return scene(replace(plan, views=(*plan.views[:2], shifted)), with_ids=False)
 
 
 def test_ids_mirrored_in_all_views_may_be_the_joints():

@@ -55,3 +55,32 @@ def laid_at(
         count=there.count[kept],
     )
     return replace(found, views=tuple(views))
+
+
+def photographed(
+    cell: Scene, lies: dict[int, complex], *, field: float = 1.45
+) -> Scene:
+    """Return a cell whose camera sees every mark within `field` pitches, at noise alone.
+
+    `lies`: index of a view -> where the centre of its plate lies beside its place, pitches.
+    """
+    plate, views = cell.plan.artifact, cell.plan.views
+    rng = np.random.default_rng(5)
+    begun = [c.stamp_ns for c in cell.commands if c.view][::2]
+    stamps = np.array([sample.stamp_ns for sample in cell.samples])
+    marks = (plate.x_m + 1j * plate.y_m).ravel()
+    detections = []
+    for seen in {d.stamp_ns: d for d in cell.detections}.values():
+        index = int(np.searchsorted(begun, seen.stamp_ns)) - 1
+        at = cell.samples[int(np.abs(stamps - seen.stamp_ns).argmin())].positions
+        beside = complex(*views[index].translation_m) - complex(*at[:2])
+        offsets = np.exp(1j * views[index].rotation_rad) * marks + beside
+        offsets = offsets + lies.get(index, 0j) * plate.grid_pitch_m
+        reach = np.maximum(np.abs(offsets.real), np.abs(offsets.imag))
+        for offset in offsets[reach < field * plate.grid_pitch_m].tolist():
+            x, y = rng.normal((offset.real, offset.imag), 2e-8).tolist()
+            detections.append(
+                replace(seen, has_id=False, m=0, n=0, offset_x=x, offset_y=y)
+            )
+    cell.detections = detections
+    return cell

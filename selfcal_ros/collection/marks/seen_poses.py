@@ -93,7 +93,8 @@ class NamedMarks:
 class SeenPose:
     """How a view's marks are seen: with the turn and shift found, or mirrored.
 
-    `explained` is the part of the marks near whose places the stage then stands.
+    `explained` is the part of the marks near whose places the stage then stands, `named` whether
+    they have ids.
     """
 
     pose: Misplaced
@@ -101,6 +102,7 @@ class SeenPose:
     mirrored: bool
     mirror: str = ""
     explained: float = 1.0
+    named: bool = True
 
     def text(self, other_views: str) -> str:
         """Return what is wrong, and the remedy, in one line; `other_views`: what they show."""
@@ -110,7 +112,8 @@ class SeenPose:
                 f"the plate as planned and measure this view again{other_views}"
             )
         error = placing_error(self.pose)
-        return f"{error.what} (or its ids are those of other marks); {error.remedy}{other_views}"
+        or_ids = " (or its ids are those of other marks)" if self.named else ""
+        return f"{error.what}{or_ids}; {error.remedy}{other_views}"
 
 
 def seen_poses(

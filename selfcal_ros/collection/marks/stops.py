@@ -89,12 +89,17 @@ def shift_of(view: View, offset_m: np.ndarray, away_m: np.ndarray) -> complex:
 
 
 def middle_of(
-    numbers: np.ndarray, width: int, known_numbers: np.ndarray | None = None
+    numbers: np.ndarray,
+    width: int,
+    known_numbers: np.ndarray | None = None,
+    *,
+    visible: tuple[int, int] | None = None,
 ) -> int:
     """Return the middle of the `width` neighbouring whole numbers that hold most of `numbers`.
 
     Of several that hold as many, but for a quarter of a number's share, that of the median of the
-    `known_numbers`, else 0.
+    `known_numbers`, else 0. With the first and last `visible` number that which lacks the fewest
+    visible ones.
     """
     low = int(max(numbers.min(), -MOST_CELLS)) - width
     count = np.bincount(np.clip(numbers - low, 0, 2 * MOST_CELLS).astype(int))
@@ -108,6 +113,12 @@ def middle_of(
         + low
         + width // 2
     )
+    if visible is not None:
+        unseen = np.setdiff1d(np.arange(visible[0], visible[1] + 1), numbers)
+        after_first = unseen - (best[:, None] - width // 2)
+        lacking = ((after_first >= 0) & (after_first < width)).sum(axis=1)
+        best = best[lacking == lacking.min()]
+        return int(best[np.abs(best).argmin()])
     middle = (
         round(float(np.median(known_numbers)))
         if known_numbers is not None and len(known_numbers)
