@@ -11,14 +11,17 @@ from selfcal_ros.bagio.messages.cdr import MAX_LENGTH
 from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.compensation.plausible import PLAUSIBLE, PLAUSIBLE_M
+from selfcal_ros.estimation.observability.plan_check import predict_plan
 from selfcal_ros.files import MAX_JSON_VALUES, MAX_YAML_BYTES, MAX_YAML_NODES
-from selfcal_ros.model.artifact import MAX_GRID_SIZE
+from selfcal_ros.model.artifact import MAX_GRID_SIZE, Artifact
+from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import MAX_VIEWS
 from selfcal_ros.nodes.sessions.compensating import LARGEST_FILE, LEAST_RADIUS_M
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.settings.nodes import CompensatorSettings
 from selfcal_ros.vision.exposures import SETTLED
 from selfcal_ros.vision.images import EXPANSION, FORMATS, LARGEST
+from test.support.lattice_plans import plan_of
 from test.support.pages import PAGES
 
 ROOT = Path(__file__).parents[2]
@@ -86,6 +89,32 @@ def test_bent_plates_do_to_the_shipped_plans_what_the_table_states(capsys):
         assert stated["predicted"]["rms_gain_xy"] == pytest.approx(
             float(gain), abs=6e-3
         )
+
+
+def test_plans_have_the_gains_that_the_table_states():
+    stated = re.search(
+        r"N = 11 the rms gain XY is \(N = 5: (\d+) to (\d+) % less, N = 21: (\d+) to (\d+) % more"
+        r".*?\| plan \|(.*?)\|\n.*?\| gain \|(.*?)\|\n",
+        (ROOT / "docs/guides/identifiability.md").read_text().replace("−", "-"),
+        re.S,
+    )
+    assert stated
+    plans, gains = (row.replace(" ", "").split("|") for row in stated.groups()[4:])
+    less, more = [], []
+    for plan, gain in zip(plans, gains, strict=True):
+        first, _, other = plan.partition("or")
+        for names in filter(None, (first, other and f"0,90,tx,{other}")):
+            small, middle, large = (
+                predict_plan(
+                    plan_of(names, Artifact(side, 0.01, 0)), ThetaDatum.ZERO_MEAN
+                ).rms_xy
+                for side in (5, 11, 21)
+            )
+            assert middle == pytest.approx(float(gain), abs=1e-3)
+            less.append(100 * (1 - small / middle))
+            more.append(100 * (large / middle - 1))
+    bounds = [round(f(values)) for values in (less, more) for f in (min, max)]
+    assert bounds == list(map(int, stated.groups()[:4]))
 
 
 METHOD = (ROOT / "docs/theory/method.md").read_text()
