@@ -275,7 +275,13 @@ def robust_calibrate(
         for finding in cleaned.findings
         if type(finding) in LEFT or (isinstance(finding, SlipFound) and finding.spoils)
     )
-    verdict = result.verdict
+    verdict = replace(
+        result.verdict,
+        causes=tuple(
+            replace(cause, details=replace(cause.details, robust=True))
+            for cause in result.verdict.causes
+        ),
+    )
     if spoiling:
         verdict = replace(
             verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *spoiling)

@@ -78,6 +78,8 @@ class CauseDetails:
         Harmonics of the angular map that do not suffice.
     nodes : tuple of int
         Nodes of the map along x and y that do not.
+    robust : bool
+        Whether what contradicts the other readings was left out already.
     """
 
     part: str = ""
@@ -92,6 +94,7 @@ class CauseDetails:
     away: float = math.nan
     harmonics: int = 0
     nodes: tuple[int, ...] = ()
+    robust: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return what there is, by name."""

@@ -234,6 +234,9 @@ _OF_DETAILS = {
 }
 """Causes whose sentences need their details."""
 
+_ROBUST = {"slip": "measure the view again", "reading": "measure it again"}
+"""What else to do about a cause that `--robust` leaves out."""
+
 _ACTIONS = {
     "microscope": "align the microscope, or have the stage stop next to the marks deliberately "
     "(check_stops)",
@@ -246,10 +249,10 @@ _ACTIONS = {
     "yaw": "declare a larger yaw:SIZE",
     "approach": "approach each mark from the same side",
     "reversal": "approach each mark from the same side",
-    "slip": "measure the view again, or solve with --robust",
+    "slip": f"{_ROBUST['slip']}, or solve with --robust",
     "rotation": "check whether the plate moved between marks and lines, and the sign of the "
     "lines' offsets",
-    "reading": "solve with --robust, or measure it again",
+    "reading": f"solve with --robust, or {_ROBUST['reading']}",
     "off_sites": "place the plate closer to its nominal pose, send the stage to the sites, or "
     "correct the stage by this map and measure again",
     "roughness": "give the map more nodes, or harmonics if it is the angular one (map in the "
@@ -581,14 +584,17 @@ def remedies(cause: Cause) -> tuple[Remedy, ...]:
     """Return the remedies of a cause: models and views to try, and the action that removes it."""
     if any(remedy.kind == "action" for remedy in cause.remedies):
         return cause.remedies
-    return (*cause.remedies, Remedy("action", _action(cause.name)))
+    return (*cause.remedies, Remedy("action", _action(cause)))
 
 
-def _action(name: str) -> str:
+def _action(cause: Cause) -> str:
     """Return what to do about a cause; of a block of another package as that says."""
+    name = cause.name
     block = blocks().get(name)
     if name not in _ACTIONS and block is not None and block.action:
         return block.action
+    if cause.details.robust and name in _ROBUST:
+        return _ROBUST[name]
     return _ACTIONS.get(name, f"remove what causes it, or declare a larger {name}:SIZE")
 
 

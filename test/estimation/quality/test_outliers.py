@@ -285,6 +285,7 @@ def test_a_turned_microscope_is_no_slip():
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
     assert result.verdict.grade is not Grade.GOOD
     assert result.verdict.causes[0].name == "microscope"
+    assert all(cause.details.robust for cause in result.verdict.causes)
     assert "no view was split" in " ".join(worded(result).warnings)
     with_term = replace(LINEAR, terms=(ModelTerm("microscope"),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})

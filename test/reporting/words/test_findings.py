@@ -282,6 +282,18 @@ def test_a_cause_in_words(found, text, size, u, unit):
     assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
 
 
+def test_after_a_robust_solution_none_is_advised_anew():
+    for name, action in (
+        ("slip", "measure the view again"),
+        ("reading", "measure it again"),
+    ):
+        cause = Cause(
+            name=name, size=1e-6, u=0.0, unit="m", details=CauseDetails(robust=True)
+        )
+        assert advice(cause) == action
+        assert "--robust" in advice(replace(cause, details=CauseDetails()))
+
+
 TURN = Cause(
     name="microscope",
     size=2e-3,
