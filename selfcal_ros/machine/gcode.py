@@ -2,9 +2,10 @@
 """The machine ``gcode``: GRBL, Marlin, Klipper and LinuxCNC, over a serial port or TCP.
 
 Positions are the machine's own coordinates: GRBL's MPos, the steps that Marlin counts, Klipper's
-M114, LinuxCNC's absolute actual position. Moves are G1 in mm with the feed rate of CELL.yaml, with
-G53 where the dialect has it. Modes of units, distances and feeds are set anew before each move: a
-pendant, another program, or a start-up line of GRBL after a reset may have changed them.
+GET_POSITION, LinuxCNC's absolute actual position. Moves are G1 in mm with the feed rate of
+CELL.yaml, with G53 where the dialect has it. Modes of units, distances and feeds are set anew
+before each move: a pendant, another program, or a start-up line of GRBL after a reset may have
+changed them.
 """
 
 import math
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from selfcal_ros.machine.calling import stopping_on_error
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.lines import Lines
-from selfcal_ros.units import M_PER_MM, MM_PER_M
+from selfcal_ros.units import M_PER_INCH, M_PER_MM, MM_PER_M
 
 DIALECTS = ("grbl", "marlin", "klipper", "linuxcnc")
 LETTERS = {"x": "X", "y": "Y", "theta": "A"}
@@ -30,7 +31,8 @@ GREETING_S = 2.0
 """Longest silence in the greeting of a board that was reset by opening its port, and
 between the answers to what was given up: Marlin says every 2 s that it is busy."""
 SAME_ZERO_MM = 0.02
-"""Difference of a position that Marlin tells, to two decimals, from its steps without an offset."""
+"""Difference of a position in its own frame, which Marlin tells to two decimals, from that of the
+machine, without an offset."""
 HOLD_S = 0.3
 """Shortest time from a feed hold to the reset: a reset during the motion loses the position."""
 MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
@@ -244,9 +246,8 @@ class _Talk:
             if answer.lower() == "ok" or answer.lower().startswith("ok "):
                 return before
             self._refuse(answer, line)
-            if not answer.startswith(("echo:busy", "//")):
-                before.append(answer)
-            else:  # it is alive
+            before.append(answer)
+            if answer.startswith(("echo:busy", "//")):  # it is alive
                 deadline = time.monotonic() + timeout_s
 
     def _set_modes(self) -> None:
@@ -382,21 +383,23 @@ class _Marlin(_Talk):
             }
 
     def position(self) -> list[float]:
-        answers = self._ok(self.QUERY)
-        for answer in answers:
+        for answer in self._answers():
             logical, _, counted = answer.partition("Count")
-            position_of_letter = {
-                letter: float(value) for letter, value in NUMBER.findall(logical)
-            }
+            position_of_letter = _by_letter(logical)
             by_steps = {
-                letter: float(value) / self._per_mm[letter]
-                for letter, value in NUMBER.findall(counted)
+                letter: steps / self._per_mm[letter]
+                for letter, steps in _by_letter(counted).items()
                 if self._per_mm.get(letter)
             }
-            self._refuse_offset(position_of_letter, by_steps)
+            self._refuse_offset(position_of_letter, by_steps | _of_duet(counted))
             position_of_letter |= by_steps
             if {LETTERS[axis] for axis in self._axes} <= position_of_letter.keys():
                 return [position_of_letter[LETTERS[axis]] for axis in self._axes]
+        raise self._tells_not_all()
+
+    def _answers(self) -> list[str]:
+        """Return what it tells of its position."""
+        answers = self._ok(self.QUERY)
         if not any(NUMBER.search(answer) for answer in answers):
             raise MachineError(
                 f"'{self.QUERY}' was answered by 'ok' alone: that of a former command, one "
@@ -404,21 +407,24 @@ class _Marlin(_Talk):
                 "controller",
                 "let nothing else write to its port, check cable and its shield, reset it",
             )
-        raise MachineError(
-            "M114 tells no position of all axes", "controller", "correct axes"
+        return answers
+
+    def _tells_not_all(self) -> MachineError:
+        return MachineError(
+            f"{self.QUERY} tells no position of all axes", "controller", "correct axes"
         )
 
     def _refuse_offset(
-        self, told: dict[str, float], by_steps: dict[str, float]
+        self, told: dict[str, float], machines: dict[str, float]
     ) -> None:
-        """Raise if moves count from another zero than the steps: G92, M206."""
-        for letter, counted in by_steps.items():
-            if abs(told.get(letter, counted) - counted) > SAME_ZERO_MM:
+        """Raise if moves count from another zero than the machine."""
+        for letter, value in machines.items():
+            if abs(told.get(letter, value) - value) > SAME_ZERO_MM:
                 raise MachineError(
-                    f"it says {letter}{told[letter]:g}, its steps say {counted:.6g} mm: an "
+                    f"it says {letter}{told[letter]:g}, the machine stands at {value:.6g} mm: an "
                     "offset is active",
                     "controller",
-                    "home it; reset G92 and M206",
+                    "home it; reset what shifts its zero: G92, M206, work and tool offsets",
                 )
 
     def move(self, travel: _Travel) -> None:
@@ -432,10 +438,28 @@ class _Marlin(_Talk):
 
 
 class _Klipper(_Marlin):
-    """Klipper's serial port (/tmp/printer): ``M114``; ``M112`` is its only stop."""
+    """Klipper's serial port (/tmp/printer): ``M112`` is its only stop.
 
-    QUERY, HALT, STEPS = "M114", b"M112\n", ""
+    ``M114`` counts from the zero of G92 and SET_GCODE_OFFSET, ``GET_POSITION`` tells both.
+    """
+
+    QUERY, HALT, STEPS = "GET_POSITION", b"M112\n", ""
     GREETING = ""
+
+    def position(self) -> list[float]:
+        positions = {
+            name: _by_letter(values)
+            for name, _, values in (
+                answer.partition(": ") for answer in self._answers()
+            )
+        }
+        machines, zero = positions.get("// gcode"), positions.get("// gcode base")
+        letters = [LETTERS[axis] for axis in self._axes]
+        if not machines or not zero or not {*letters} <= machines.keys() & zero.keys():
+            raise self._tells_not_all()
+        at = {letter: machines[letter] for letter in letters}
+        self._refuse_offset({letter: at[letter] - zero[letter] for letter in at}, at)
+        return [*at.values()]
 
 
 class _LinuxCnc(_Talk):
@@ -449,6 +473,12 @@ class _LinuxCnc(_Talk):
 
     def _begin(self) -> None:
         self._greet(self._lines)
+        unit = self._get("user_linear_units")
+        if unit not in UNIT_MM:
+            raise MachineError(
+                f"its unit is '{unit}'", "controller", "set LINEAR_UNITS to mm or inch"
+            )
+        self._unit_mm = UNIT_MM[unit]
         self._take_over()
         self._for_stop = self._lines.again()
         try:
@@ -495,18 +525,26 @@ class _LinuxCnc(_Talk):
             if answer.endswith(("ACK", "NAK")) or answer.startswith("ERROR"):
                 return answer
 
+    def _get(self, name: str) -> str:
+        """Return what a get command tells; other answers are passed over."""
+        self._lines.send(f"get {name}")
+        answer = ""
+        while not answer.startswith(name.upper()):
+            answer = self._lines.receive().upper()
+        return answer.removeprefix(name.upper()).strip()
+
     def position(self) -> list[float]:
-        self._lines.send("get abs_act_pos")
-        answer = self._lines.receive()
-        while not answer.upper().startswith("ABS_ACT_POS"):
-            answer = self._lines.receive()
-        values = [float(word) for word in answer.split()[1:]]
+        text = self._get("abs_act_pos")
+        values = [float(word) for word in text.split()]
         places = [self.ORDER.index(LETTERS[axis]) for axis in self._axes]
         if max(places) >= len(values):
             raise MachineError(
-                f"its position is '{answer}'", "controller", "correct axes"
+                f"its position is '{text}'", "controller", "correct axes"
             )
-        return [values[place] for place in places]
+        return [
+            values[place] * (1.0 if axis == "theta" else self._unit_mm)
+            for axis, place in zip(self._axes, places, strict=True)
+        ]
 
     def move(self, travel: _Travel) -> None:
         if not self._is_enabled:
@@ -524,6 +562,8 @@ class _LinuxCnc(_Talk):
         self._for_stop.close()
 
 
+UNIT_MM = {"MM": 1.0, "CM": 10.0, "INCH": MM_PER_M * M_PER_INCH}
+"""LINEAR_UNITS of LinuxCNC's INI file, in which it tells positions, whatever those of moves are."""
 ACCELERATION = {"x": "$120=", "y": "$121=", "theta": "$123="}
 """GRBL's setting of an axis, mm/s^2 or deg/s^2."""
 
@@ -544,6 +584,18 @@ def _least_acceleration(settings: list[str], axes: tuple[str, ...]) -> float:
 
 
 NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")
+
+
+def _by_letter(text: str) -> dict[str, float]:
+    return {letter: float(value) for letter, value in NUMBER.findall(text)}
+
+
+def _of_duet(text: str) -> dict[str, float]:
+    """Return the machine's position that RepRapFirmware tells behind its own, mm."""
+    _, _, machines = text.partition("Machine")
+    return dict(
+        zip("XY", map(float, re.findall(r"-?\d+\.\d+", machines)), strict=False)
+    )
 
 
 def _numbers(text: str) -> list[float]:

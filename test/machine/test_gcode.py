@@ -15,6 +15,7 @@ from selfcal_ros.settings.nodes import CollectorSettings
 from test.machine.test_measuring import away_from
 from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
 from test.support.firmware import (
+    Duet,
     FaultyGrbl,
     Grbl,
     Klipper,
@@ -227,17 +228,40 @@ def test_a_mode_that_another_sets_between_moves_changes_no_move(dialect, mode):
     assert firmware.at["X"] == pytest.approx(3.0)
 
 
-def test_a_marlin_whose_moves_count_from_another_zero_is_refused_and_not_moved():
+@pytest.mark.parametrize(
+    ("dialect", "kind"),
+    [("marlin", Marlin), ("marlin", Duet), ("klipper", Klipper)],
+)
+def test_a_controller_whose_moves_count_from_another_zero_is_refused_and_not_moved(
+    dialect, kind
+):
     """G92 X0 at 100 mm: a move to 100.05 by its steps would go to 200.05."""
-    firmware = Marlin()
+    firmware = kind()
     firmware.at["X"], firmware.zero = 100.0, 100.0
     with over_tcp(firmware) as port:
-        machine = GcodeMachine(port, "marlin", feed=6000.0)
-        said = "it says X0, its steps say 100 mm: an offset is active"
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        said = "it says X0, the machine stands at 100 mm: an offset is active"
         with pytest.raises(MachineError, match=said):
             machine.move_to((0.10005, 0.0))
+        firmware.zero = 0.0
+        machine.move_to((0.10005, 0.0))
+        assert machine.position() == pytest.approx((0.10005, 0.0), abs=7e-6)
         machine.close()
-    assert not [line for line in firmware.lines if line.startswith("G1")]
+    assert len([line for line in firmware.lines if line.startswith("G1")]) == 1
+
+
+def test_a_linuxcnc_in_inches_tells_where_it_is():
+    """Its numbers are in the unit of its INI file; taken for mm the first small move is long."""
+    firmware = LinuxCnc()
+    firmware.unit, firmware.per_mm = "INCH", 1 / 25.4
+    firmware.at |= {"X": 100.0, "A": 90.0}
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "linuxcnc", feed=6000.0, axes=["x", "y", "theta"])
+        assert machine.position() == pytest.approx((0.1, 0.0, np.pi / 2), abs=1e-7)
+        machine.close()
+        firmware.unit = "CUSTOM"
+        with pytest.raises(MachineError, match="its unit is 'CUSTOM'"):
+            GcodeMachine(port, "linuxcnc", feed=6000.0)
 
 
 @pytest.mark.parametrize("dialect", KINDS)

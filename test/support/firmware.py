@@ -174,12 +174,35 @@ class Marlin(Firmware):
         return b"ok P15 B3\n"
 
 
+class Duet(Marlin):
+    """RepRapFirmware: M114 tells the position in the frame of the tool, and the machine's."""
+
+    def answer(self, line):
+        if line == "M92":
+            return b"Steps/mm: X: 80.000, Y: 80.000, Z: 400.000, E: 420.000\nok\n"
+        if line == "M114 R":
+            x, y = self.at["X"], self.at["Y"]
+            return (
+                f"X:{x - self.zero:.3f} Y:{y:.3f} Z:0.000 E:0.000 E0:0.0 Count 800 1600 0 "
+                f"Machine {x:.3f} {y:.3f} 0.000 Bed comp 0.000\nok\n"
+            ).encode()
+        return super().answer(line)
+
+
 class Klipper(Firmware):
     def answer(self, line):
         if self.alarm:
             return b"!! Must home axis first\nok\n"
-        if line == "M114":
-            return f"X:{self.at['X']:.3f} Y:{self.at['Y']:.3f} Z:0.000 E:0.000\nok\n".encode()
+        if line == "GET_POSITION":
+            at = f"X:{self.at['X']:.6f} Y:{self.at['Y']:.6f} Z:0.000000"
+            return (
+                "// mcu: stepper_x:100 stepper_y:200 stepper_z:0\n"
+                "// stepper: stepper_x:7.000000 stepper_y:8.000000 stepper_z:0.000000\n"
+                f"// kinematic: X:7.000000 Y:8.000000 Z:0.000000\n// toolhead: {at} E:0.000000\n"
+                f"// gcode: {at} E:0.000000\n"
+                f"// gcode base: X:{self.zero:.6f} Y:0.000000 Z:0.000000 E:9.000000\n"
+                "// gcode homing: X:0.000000 Y:0.000000 Z:0.000000\nok\n"
+            ).encode()
         if line == "M112":
             self.stopped += 1
         elif line.startswith("G1"):
@@ -194,6 +217,8 @@ class LinuxCnc(Firmware):
     """
 
     move_s = 0.0
+    unit, per_mm = "MM", 1.0
+    """LINEAR_UNITS of its INI file."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -237,11 +262,14 @@ class _Rsh(Firmware):
             return echo + (
                 b"HELLO ACK EMCNETSVR 1.1\r\n" if rest[0] == "EMC" else b"HELLO NAK\r\n"
             )
+        if line == "get user_linear_units":
+            return echo + f"USER_LINEAR_UNITS {machine.unit}\r\n".encode()
         if line == "get abs_act_pos":
+            x, y = (machine.at[letter] * machine.per_mm for letter in "XY")
             return (
                 echo
                 + (
-                    f"ABS_ACT_POS {machine.at['X']:.6f} {machine.at['Y']:.6f} 0.000000 "
+                    f"ABS_ACT_POS {x:.6f} {y:.6f} 0.000000 "
                     f"{machine.at['A']:.6f} 0.000000 0.000000\r\n"
                 ).encode()
             )
