@@ -241,6 +241,20 @@ def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
     assert 0.93 < np.mean(inside) <= 1.0
 
 
+@pytest.mark.parametrize(("off_m", "first"), [(2e-6, "roughness"), (50e-6, "reading")])
+def test_the_likelier_of_a_rough_stage_and_a_reading_that_is_off_is_named_first(
+    off_m, first
+):
+    rng = np.random.default_rng([1, 2])
+    found, _ = readings(plate(11, 7), SIX, rng, sigma=20e-9, stage=waves(rng, 2))
+    view = found.views[2]
+    off = replace(view, dx=view.dx + off_m * (np.arange(len(view.m)) == 40))
+    found = replace(found, views=(*found.views[:2], off, *found.views[3:]))
+    causes = calibrate(found, Options(assumed=())).verdict.causes
+    assert causes[0].name == first
+    assert "reading" in [cause.name for cause in causes]
+
+
 @pytest.mark.parametrize("bent", [False, True])
 def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
     """What lies between the nodes goes into no term; a plate that is bent as well is found."""

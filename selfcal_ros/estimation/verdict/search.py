@@ -22,6 +22,7 @@ from selfcal_ros.estimation.terms.equations import SizeTest
 from selfcal_ros.estimation.verdict.causes import (
     MAX_CAUSES,
     READING,
+    SLIP,
     Explanation,
     OffSites,
     cause_of,
@@ -333,7 +334,15 @@ class Search:
             if advise and not rough.of_lines:
                 nodes = self._better_map()
             remedies = (Remedy("map", nodes),) if nodes else ()
-            self.causes.append(replace(cause, remedies=remedies))
+            # a map that cannot follow the stage makes single readings stand out
+            less_likely = (
+                place
+                for place, other in enumerate(self.causes)
+                if other.name in (READING, SLIP) and other.p > cause.p
+            )
+            self.causes.insert(
+                next(less_likely, len(self.causes)), replace(cause, remedies=remedies)
+            )
 
     def _better_map(self) -> str:
         """Return the first map (--map) with which nothing contradicts the readings; else empty."""
