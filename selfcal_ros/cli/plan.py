@@ -363,6 +363,7 @@ def _check_text(
         *([NODES_UNTESTED] if checked.nodes_untested else []),
         *_unchecked_text(observability),
         _check_stops_text(plan),
+        *([] if _lines_show_their_sign(plan) else [LINES_SIGN]),
         *([] if reads_between_nodes(plan.views, artifact) else [NODES_ONLY]),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}",
@@ -432,6 +433,19 @@ def _check_stops_text(plan: Plan) -> str:
         f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
         f"and y: {4 * marks} more exposures"
     )
+
+
+LINES_SIGN = (
+    "marks and lines are read together in fewer than two views: the sign of the lines' offsets "
+    "shows only if the stage happens to stop off its lines; read both in two views, the plate "
+    "turned by 0.1 mrad or more between them"
+)
+
+
+def _lines_show_their_sign(plan: Plan) -> bool:
+    """Return whether lines turn with the marks from view to view, or there are none."""
+    together = sum(view.grid and view.angular for view in plan.views)
+    return together > 1 or not any(view.angular for view in plan.views)
 
 
 def _unchecked_text(observability: Observability) -> list[str]:

@@ -777,7 +777,9 @@ def test_a_plan_whose_harmonics_nothing_tests_says_so_before_it_is_measured(
     text = Path(shipped("rotary")).read_text()
     fewer = tmp_path / "two_views.yaml"
     fewer.write_text(
-        text.replace("  - {name: turned_101, rotation_deg: 101, grid: false}\n", "")
+        text.replace(
+            "  - {name: turned_101, rotation_deg: 101, grid: false}\n", ""
+        ).replace("[1, 0]}", "[1, 0], angular: false}")
     )
     said = "do not show whether the harmonics of the angular map suffice"
     for path, is_said in ((fewer, True), (shipped("rotary"), False)):
@@ -785,6 +787,16 @@ def test_a_plan_whose_harmonics_nothing_tests_says_so_before_it_is_measured(
         assert (said in capsys.readouterr().out) is is_said
         main(["plan", "check", str(path), "--json"])
         assert json.loads(capsys.readouterr().out)["harmonics_untested"] is is_said
+
+
+def test_a_plan_that_does_not_show_the_sign_of_the_lines_says_so(tmp_path, capsys):
+    text = Path(shipped("rotary")).read_text()
+    once = tmp_path / "once.yaml"
+    once.write_text(text.replace("[1, 0]}", "[1, 0], angular: false}"))
+    said = "marks and lines are read together in fewer than two views: the sign of "
+    for path, is_said in ((once, True), (shipped("rotary"), False)):
+        assert main(["plan", "check", str(path)]) == 0
+        assert (said in capsys.readouterr().out) is is_said
 
 
 @pytest.mark.parametrize(("marks", "is_said"), [(4, True), (7, False)])

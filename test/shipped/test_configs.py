@@ -5,13 +5,18 @@ import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from selfcal_ros import __version__
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_json, read_yaml
 from selfcal_ros.model.plan_form import plan_from_dict
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.spec import read_simulation
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 ROOT = Path(__file__).parents[2]
 
@@ -22,10 +27,29 @@ def shipped(folder, pattern="*.yaml"):
     )
 
 
+FULL_PLANS = [
+    path
+    for path in sorted((ROOT / "config/plans").glob("*.yaml"))
+    if path.stem != "recheck" and not path.stem.startswith("deficient")
+]
+"""Those that need nothing else to identify the stage."""
+
+
 @shipped("config/plans")
 def test_plans_load(path):
     plan = plan_from_dict(read_yaml(path), str(path))
     assert plan.plan_id and plan.views
+
+
+@pytest.mark.parametrize("path", FULL_PLANS, ids=lambda path: path.name)
+def test_a_smooth_stage_measured_by_a_plan_is_calibrated(path):
+    plan = plan_from_dict(read_yaml(path), str(path))
+    rng = np.random.default_rng(1)
+    spread = Spread(phi_rad=3e-4, correlation_pitches=3.0)
+    truth = random_truth(plan.artifact, len(plan.views), rng, spread)
+    settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5)
+    readings = simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    assert calibrate(readings).verdict.grade is Grade.GOOD
 
 
 @shipped("config/simulations")

@@ -276,8 +276,9 @@ FIXED: dict[type, str] = {
     ),
     LinesSignNotShown: (
         "nothing in the readings shows the sign of offset_theta, and with the other sign the "
-        "angular map would be that of a different stage: turn the plate by 0.1 mrad or more "
-        "between the views, or declare the microscope (--microscope 0.01)"
+        "angular map would be that of a different stage: read marks and lines together in two "
+        "views, the plate turned by 0.1 mrad or more between them, or declare the microscope "
+        "(--microscope 0.01)"
     ),
     NotConverged: (
         "the estimate converged only without the assumptions about the measurement, which the "
