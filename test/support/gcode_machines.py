@@ -97,6 +97,8 @@ class Machine:
             0,
             0,
         )
+        if self.printer:  # G92 before the program
+            self.shift[:2] = 2.0, -1.0
         self.feed, self.inverse, self.merging, self.ended = 0.0, False, 0.005, False
         self.strict = corrected and dialect == "linuxcnc"
         self.percent, self.moves, self.zero, self.sticky = 0, [], None, {}
@@ -157,6 +159,9 @@ class Machine:
                     self.shift[i] = self.at[i] - (words.get(axis) or 0.0)
         elif name in PLACES[self.dialect]:
             self.at[:3] = PLACES[self.dialect][name]
+            if name == "G28":  # of the homed axes
+                named = [i for i, axis in enumerate("XYZ") if axis in words]
+                self.shift[named or [0, 1, 2]] = 0.0
             self._traced()
         elif name in ("M206", "M218", "M665") or name.startswith(
             ("SET_GCODE_OFFSET", "T")

@@ -147,6 +147,8 @@ class Rewriter:
         self._at = dict.fromkeys("XYZE", math.nan)  # as programmed; nan if not known
         self._sent = dict.fromkeys("XYZE", 0.0)  # as commanded
         self._begun = self._ended = self._drawn = False
+        self._homed: set[str] = set()  # axes, before the first move
+        self._frame_ended = False
         self._where = ""
         self.moves = self.pieces = 0
         self.reach_m = np.array([[math.inf] * 2, [-math.inf] * 2])
@@ -179,6 +181,8 @@ class Rewriter:
             lines = self._move_lines(act, line)
         if line.code("set E"):
             self._at["E"] = line.number("E")
+        if line.code("home") and self._printer:
+            self._end_offset(line)
         for code in line.codes:
             self._at |= dict.fromkeys(FORGETS.get(code.does, ""), math.nan)
         return lines
@@ -234,8 +238,9 @@ class Rewriter:
         names = " ".join(code.name for code in line.codes)
         acts = [code for code in line.codes if code.does in ACTS]
         modes = [code.does for code in line.codes if code.does in MODES]
+        conflicting = {"linuxcnc": ["path"], "grbl": ["offset"]}.get(self.dialect, [])
         crowded = len(line.codes) > 1 and (
-            self._printer or bool(acts and "path" in modes)
+            self._printer or bool(acts and {*conflicting} & {*modes})
         )
         if crowded or len(acts) > 1 or len(modes) > len(set(modes)):
             self._refuse(f"{names} in one line", "write a line for each")
@@ -282,6 +287,13 @@ class Rewriter:
                 "the way home passes a point that is not corrected",
                 "write G91 with it, and X0, Y0",
             )
+
+    def _end_offset(self, line: ProgramLine) -> None:
+        """Follow that homing ends an offset of G92 that was in force before the program."""
+        if not self._drawn:
+            self._homed |= {*(line.named("XYZ") or "XY")}
+        elif line.named("XYZ") != ["Z"]:
+            self._frame_ended = not {*"XY"} <= self._homed
 
     def _set_mode(self, code: Code) -> None:
         """Follow a mode."""
@@ -349,6 +361,11 @@ class Rewriter:
         self, act: Code, line: ProgramLine, ends: Mapping[str, float]
     ) -> list[str]:
         """Return the lines of a move in XY."""
+        if self._frame_ended:
+            self._refuse(
+                "G28 has ended an offset that G92 may have set before the program",
+                "home X and Y before the first move as well",
+            )
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
         known_m = end_m if self._travels(act, line) else start_m + end_m

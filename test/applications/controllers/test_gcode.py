@@ -402,7 +402,11 @@ grbl | +G0 X0 Y0 // G2 X0 Y0.0001 I5 | 5: the arc ends
 grbl | +G0 X0 Y0 // G2 X10 I5 P2 | 5: P is not a word of G2; write each repeat, turn
 grbl | +G1 X5 Y5 | 4: the position before this line is not known
 marlin | +G1 X5 Y5 | 4: the position before this line is not known; write an absolute move of X and
-klipper | +G0 X0 Y0 // G28 // G1 X5 Y5 ; E1 | 6: the position before this line is not known
+klipper | G28 // +G0 X0 Y0 // G28 // G1 X5 Y5 ; E1 | 7: the position before this line is not known
+klipper | +G0 X0 Y0 // G28 // G0 X5 Y5 | 6: G28 has ended an offset that G92 may have set before
+marlin | G28 Y // +G0 X0 Y0 // G28 X // G0 X5 | 7: G28 has ended an offset that G92 may have set
+grbl | +G0 Z5 // G49 X5 | 5: G49 G0 in one line; write a line for each
+grbl | +G1 G49 X5 | 4: G1 G49 in one line
 marlin | +G1 X5 Y5 E1 | 4: the position before this line is not known
 marlin | +G0 X0 Y0 // G1 X40 Y20 E1 | 5: E before this line is not known
 linuxcnc | +G61 // G0 X0 Y0 // G2 I5 G64 P0.01 Q0 | 6: G2 G64 in one line; write a line
@@ -442,8 +446,7 @@ BEFORE = dict.fromkeys(("grbl", "linuxcnc"), "G21 G90\nG17\nF9\n") | dict.fromke
 @pytest.mark.parametrize(("dialect", "text", "message"), CASES)
 def test_what_cannot_be_corrected_is_one_line(dialect, text, message):
     text = re.sub(" // ", "\n", text)
-    if text[0] == "+":
-        text = BEFORE[dialect] + text[1:]
+    text = re.sub(r"^\+", BEFORE[dialect], text, count=1, flags=re.MULTILINE)
     with pytest.raises(InputError) as raised:
         corrected(text, dialect)
     assert str(raised.value).startswith(f"a.nc:{message}") and "\n" not in str(
