@@ -437,7 +437,7 @@ class Compensator:
             raise InputError(
                 "position",
                 f"({x.flat[first]:.9g}, {y.flat[first]:.9g}) m lies outside the calibrated field",
-                "stay inside or use clamp",
+                "stay inside, or have it corrected as the nearest point of the edge",
             )
 
     def _refuse_no_theta(self) -> None:

@@ -250,7 +250,9 @@ def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys)
 
 def test_outside_refused_and_not_qualified(desk, capsys):
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
-    assert "outside the calibrated field" in capsys.readouterr().err
+    refusal = capsys.readouterr().err
+    assert "outside the calibrated field" in refusal
+    assert "nearest point of the edge" in refusal and "clamp" not in refusal
     doubt = replace(
         result_of(MAP),
         verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."),
