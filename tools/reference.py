@@ -55,7 +55,7 @@ PLAN = {
     "check_stops.offset": "distance of the stage from the mark, m; at most a quarter of the pitch",
     "map": "nodes of the error map where they are not the sites of the plate's lattice "
     "(docs/guides/identifiability.md); default: those sites, or for views off the lattice "
-    "three quarters as many nodes as marks over the same field",
+    "an odd number of nodes, at most three quarters of the marks, over the same field",
     "map.grid_size": "nodes along x, from 3",
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",

@@ -45,8 +45,7 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="size of a term against which the plan is judged, a standard "
-        "deviation in SI units; TERM is microscope, drift, plate_scale, plate_shape "
-        "or approach; none: not even the terms assumed by default",
+        "deviation in SI units; none: not even the terms assumed by default",
     )
     parser.add_argument(
         "--drift-degree",
@@ -297,7 +296,7 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
     for c in checks:
         separable = "yes" if c.determined else f"no, {c.unseen_modes} unseen"
         lines.append(
-            f"  {c.name:<13}{c.model or '-':<6}{separable:<14}{size_text(c):>11}"
+            f"  {c.name:<12} {c.model or '-':<6}{separable:<14}{size_text(c):>11}"
             f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
             f" {100 * c.power:7.1f} %"
         )

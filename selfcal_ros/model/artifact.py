@@ -356,10 +356,11 @@ class Artifact:
 def default_map_grid(artifact: Artifact) -> MapGrid:
     """Return the map's nodes for views off the lattice, where a plan does not give them.
 
-    They span the field of the plate; along its longer side there are three quarters as many nodes
-    as marks, at least five if there are as many marks, at most `DEFAULT_NODES`. With as many nodes
-    as marks the readings hardly determine the outermost ones. Of a list, as many marks count along
-    a side as a lattice of the same number would have over the rectangle that it covers.
+    They span the field of the plate; along its longer side there is an odd number of nodes, at most
+    three quarters of the marks, at least five if there are as many marks, at most `DEFAULT_NODES`.
+    With as many nodes as marks the readings hardly determine the outermost ones. Of a list, as many
+    marks count along a side as a lattice of the same number would have over the rectangle that it
+    covers.
 
     Raises
     ------
