@@ -3,6 +3,7 @@
 
 import json
 import re
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
@@ -157,6 +158,15 @@ def test_the_site_reads_a_page_as_github_does(page):
             f"no line above {line}"
         )
         above = line
+
+
+def test_the_declaration_of_quality_names_every_dependency():
+    stated = (ROOT / "QUALITY_DECLARATION.md").read_text().lower()
+    named = re.findall(r"[\w-]+", re.search(r"\| 5 dependencies \|(.*?):", stated)[1])
+    needed = [line for line in requires("selfcal_ros") if "extra ==" not in line]
+    assert needed and {re.match(r"[\w-]+", line)[0].lower() for line in needed} < {
+        *named
+    }
 
 
 def test_the_security_page_states_the_bounds_of_the_code():
