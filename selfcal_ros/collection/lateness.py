@@ -17,7 +17,7 @@ AT_LEAST = 5
 """Smallest number of detections, of a stage that is elsewhere or moves, that show a lag."""
 NEARLY_ALL = 0.9
 """Fraction of them that a lag explains."""
-LATE = 50
+LATE = 200
 """Largest lag, in usual times between two exposures; nor is it above `MAX_AHEAD_NS`."""
 FINE = 10
 """Lags tried in a usual time between two exposures."""

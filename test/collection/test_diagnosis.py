@@ -453,6 +453,12 @@ def test_stamps_of_another_time(late_s, said, sense):
     assert "not of their arrival" in found[None] and "by one clock" in found[None]
 
 
+def test_stamps_that_are_late_by_sixty_marks_of_a_fast_cell():
+    cell = scene(count=0, size=13, exposure_period_s=0.05)
+    found = findings(stamped_late(cell, 3.0).events)
+    assert f"stage_not_at_mark: {REST} 3 s before their" in found[None]
+
+
 @pytest.mark.parametrize("repeats", [1, 3])
 def test_stamps_that_are_late_by_times_that_vary(repeats):
     cell = scene(plan_of("0, 90", 7, count=0, repeats=repeats), exposure_period_s=0.05)
