@@ -23,6 +23,8 @@ from selfcal_ros.vision.images import picture_of
 
 LEAST_S = 0.1
 """Shortest time of a trajectory."""
+FRESH_S = 1.0
+"""Longest wait for the position to stop at: an older one lies behind, and would be a way back."""
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Heard from reliable publishers as well."""
 
@@ -132,20 +134,23 @@ class JointTrajectoryMachine:
             self._image = message
             self._news.notify_all()
 
-    def _wait(self, arrived: Callable[[], bool], topic: str) -> None:
+    def _wait(self, arrived: Callable[[], bool], topic: str, timeout_s: float) -> None:
         """Wait for news; `self._news` is held."""
-        if not self._news.wait_for(arrived, self._timeout_s):
+        if not self._news.wait_for(arrived, timeout_s):
             raise MachineError(
-                f"no message in {self._timeout_s:g} s",
+                f"no message in {timeout_s:g} s",
                 topic,
                 "check the driver, the topic and the names of the joints",
             )
 
     def position(self) -> tuple[float, ...]:
         """Return the next position that is published, m and rad."""
+        return self._next_position(self._timeout_s)
+
+    def _next_position(self, timeout_s: float) -> tuple[float, ...]:
         with self._news:
             before = self._states[0]
-            self._wait(lambda: self._states[0] > before, self._states_topic)
+            self._wait(lambda: self._states[0] > before, self._states_topic, timeout_s)
             return self._states[1]
 
     def move_to(self, position: tuple[float, ...]) -> None:
@@ -183,7 +188,7 @@ class JointTrajectoryMachine:
             return self._image is not None and stamp_ns(self._image) >= began_ns
 
         with self._news:
-            self._wait(is_new, self._image_topic)
+            self._wait(is_new, self._image_topic, self._timeout_s)
             message: Any = self._image
         return Image(picture_of(message).values, stamp_ns(message))
 
@@ -197,10 +202,9 @@ class JointTrajectoryMachine:
         Raises
         ------
         MachineError
-            If no controller listens, or the newest position is none.
+            If no controller listens, or no position is published now, or it is none.
         """
-        with self._news:
-            position = self._states[1]
+        position = self._next_position(min(FRESH_S, self._timeout_s))
         if not all(map(math.isfinite, position)):
             raise MachineError(
                 f"the position is {position}", self._states_topic, "check the encoders"

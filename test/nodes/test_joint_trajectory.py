@@ -30,6 +30,7 @@ class Controller(Node):
         super().__init__("controller", context=context)
         self._simulated = simulated
         self.at, self._way, self.goals = np.zeros(2), None, []
+        self.is_heard = True
         self._states = self.create_publisher(JointState, "joint_states", 10)
         self._images = self.create_publisher(Image, "camera/image", 10)
         self.create_subscription(
@@ -52,7 +53,8 @@ class Controller(Node):
                 1.0, (time.monotonic() - began) / needed
             )
         message = JointState(name=["gy", "gx"], position=[self.at[1], self.at[0]])
-        self._states.publish(message)
+        if self.is_heard:
+            self._states.publish(message)
 
     def _show(self) -> None:
         stamp_ns = time.time_ns()
@@ -138,6 +140,19 @@ def test_a_position_that_is_no_number_is_not_commanded_at_a_stop(controller):
         while np.isfinite(machine.position()).all():
             pass
         with pytest.raises(MachineError, match=r"the position is .*nan"):
+            machine.stop()
+        assert not node.goals
+    finally:
+        machine.close()
+
+
+def test_a_stop_does_not_lead_back_to_where_the_stage_was_last_heard_of(controller):
+    node, _, _ = controller
+    machine = JointTrajectoryMachine(**KEYS, timeout=0.5)
+    try:
+        machine.position()
+        node.is_heard = False
+        with pytest.raises(MachineError, match=r"joint_states: no message in 0\.5 s"):
             machine.stop()
         assert not node.goals
     finally:
