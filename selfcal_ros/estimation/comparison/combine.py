@@ -26,6 +26,11 @@ from selfcal_ros.estimation.comparison.covariance import (
     covariance_of,
     kept_covariances,
 )
+from selfcal_ros.estimation.comparison.lengths import (
+    Lengths,
+    lengths_of,
+    require_one_text,
+)
 from selfcal_ros.estimation.comparison.maps import (
     KINDS,
     ReducedNoise,
@@ -62,7 +67,7 @@ from selfcal_ros.model.findings import (
 )
 from selfcal_ros.model.parts import Combined, CombinedRun, Parts
 from selfcal_ros.model.recheck import Significance
-from selfcal_ros.model.reference import CERTIFIED_WITH, Certified, ReferenceLength
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
     COMBINED,
     ArtifactMap,
@@ -345,12 +350,13 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
     ----------
     squares : float array (runs, n)
         n values of each run, independent of each other and with the same variance.
-    within : float array (runs,)
-        Variance of these values within each run.
+    within : float array (runs,) or (runs, runs)
+        Variance of these values within each run; covariance where runs share some of it.
     """
+    alone = 1.0 if within.ndim == 1 else np.eye(len(within))
 
     def excess(variance: float) -> float:
-        return _scatter(squares, within + variance) - (len(within) - 1)
+        return _scatter(squares, within + variance * alone) - (len(within) - 1)
 
     high = float(((squares - squares.mean(axis=0)) ** 2).sum(axis=0).mean())
     if not high > 0 or excess(0.0) <= 0:
@@ -360,6 +366,11 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
 
 def _scatter(squares: np.ndarray, within: np.ndarray) -> float:
     """Return the scatter of values about their weighted means, over their variances."""
+    if within.ndim == 2:
+        inverse = np.linalg.inv(within + TINY * np.eye(len(within)))
+        weight = inverse.sum(axis=0)
+        deviations = squares - weight @ squares / weight.sum()
+        return float((deviations * (inverse @ deviations)).sum(axis=0).mean())
     weight = 1 / np.maximum(within, TINY)
     deviations = squares - weight @ squares / weight.sum()
     return float((weight @ deviations**2).mean())
@@ -373,8 +384,8 @@ class _Family:
     ----------
     values : float array (runs, n)
         The amplitude, n = 1; or what the shapes leave, as that of independent values.
-    within : float array (runs,)
-        Their variance within each run.
+    within : float array (runs,) or (runs, runs)
+        Their variance within each run; covariance where runs share some of it.
     share : float array (d,)
         Variance of each value of the map for a variance of 1.
     most : int
@@ -397,14 +408,19 @@ class _Family:
 
 
 def _families(
-    runs: list[RunValues], q: np.ndarray, shapes: np.ndarray
+    runs: list[RunValues],
+    q: np.ndarray,
+    shapes: np.ndarray,
+    lengths: Lengths | None = None,
 ) -> list[_Family]:
     """Return the families of values: one for each shape, and what is left, if anything is."""
     values = np.stack([run.values for run in runs])
     amplitude = values @ shapes
     within = np.stack([variances_of(run.covariance, shapes) for run in runs])
     families = [
-        _Family(amplitude[:, [m]], within[:, m], shape**2, 1)
+        _Family(
+            amplitude[:, [m]], _with_lengths(within[:, m], shape, lengths), shape**2, 1
+        )
         for m, shape in enumerate(shapes.T)
     ]
     removed = np.concatenate([q, shapes], axis=1)
@@ -422,7 +438,21 @@ def _families(
     return families
 
 
-def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> Mean:
+def _with_lengths(
+    variance: np.ndarray, shape: np.ndarray, lengths: Lengths | None
+) -> np.ndarray:
+    """Return the variance of the amplitude of a shape within runs, with their lengths."""
+    if lengths is None or not (of_scale := float(shape @ lengths.place) ** 2):
+        return variance
+    return np.diag(variance) + of_scale * lengths.differing
+
+
+def mean_of(
+    runs: list[RunValues],
+    removed: np.ndarray,
+    shapes: np.ndarray,
+    lengths: Lengths | None = None,
+) -> Mean:
     """Return the weighted mean of runs.
 
     Parameters
@@ -433,8 +463,13 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         Columns that are the datum of each run, which is removed.
     shapes : float array (d, m)
         Shapes whose amplitudes vary between runs each by its own; the rest has one variance.
+    lengths : Lengths, optional
+        What sets the scale of each run, beside its covariance.
     """
     q, shapes = independent_of(removed, shapes)
+    lengths = lengths or Lengths.none(len(runs), len(q))
+    place = lengths.place - q @ (q.T @ lengths.place)
+    lengths = replace(lengths, place=place)
     runs = [
         replace(
             run,
@@ -444,20 +479,24 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         )
         for run in runs
     ]
-    families = _families(runs, q, shapes)
+    families = _families(runs, q, shapes, lengths)
     spread = np.sum([family.between * family.share for family in families], axis=0)
     weights = 1 / np.maximum(
-        [variances(run.covariance).sum() + spread.sum() for run in runs], TINY
+        [variances(run.covariance).sum() + spread.sum() for run in runs]
+        + lengths.power,
+        TINY,
     )
     weights = weights / weights.sum()
-    together = _Runs(runs, weights, q)
+    together = _Runs(runs, weights, q, lengths)
     pooled, shared = weights**2, weights @ together.shares
     within = sum(
         w * variances(run.covariance) for w, run in zip(pooled, runs, strict=True)
     )
-    common = shared**2 * variances(together.common)
+    of_certificates, of_all = lengths.within(weights), lengths.common(weights)
+    within = within + of_certificates * place**2
+    common = shared**2 * variances(together.common) + of_all * place**2
     between = pooled.sum() * spread
-    covariance = together.total(pooled, shared)
+    covariance = together.total(pooled, shared, of_certificates + of_all)
     added = spread
     if covariance.ndim == 2:
         of_shapes = np.array([family.between for family in families[: shapes.shape[1]]])
@@ -499,11 +538,14 @@ class _Runs:
         Weights, sum 1.
     q : float array (d, r)
         Orthonormal columns of the datum.
+    lengths : Lengths
+        Their reference lengths.
     """
 
     runs: list[RunValues]
     weights: np.ndarray
     q: np.ndarray
+    lengths: Lengths
 
     @cached_property
     def values(self) -> np.ndarray:
@@ -523,14 +565,20 @@ class _Runs:
             [run.common for run in self.runs], weights / max(weights.sum(), TINY)
         )
 
-    def total(self, factors: np.ndarray, shared: float = 0.0) -> np.ndarray:
+    def total(
+        self, factors: np.ndarray, shared: float = 0.0, scale: float = 0.0
+    ) -> np.ndarray:
         """Return the covariance of a combination of runs.
 
-        `factors` are the squares of those of the runs, `shared` is that of the common part.
+        `factors` are the squares of those of the runs, `shared` is that of the common part,
+        `scale` the variance of its scale by the reference lengths, 1 = (m/m)^2.
         """
+        place = self.lengths.place
+        is_full = any(run.covariance.ndim == 2 for run in self.runs)
+        of_scale = np.outer(place, place) if is_full else place**2
         return _sum(
-            [*(run.covariance for run in self.runs), self.common],
-            np.append(factors, shared**2),
+            [*(run.covariance for run in self.runs), self.common, of_scale],
+            np.append(factors, [shared**2, scale]),
         )
 
     def noise_dof(self, factors: np.ndarray) -> float:
@@ -584,13 +632,18 @@ class _Runs:
         others = np.where(this, 0.0, self.weights)
         others = others / others.sum()
         deviation = self.values[i] - others @ self.values
-        factors = others**2 + this
-        total = self.total(factors, self.shares[i] - others @ self.shares)
+        factors, signed = others**2 + this, this - others
+        of_scale = float(signed @ self.lengths.differing @ signed)
+        total = self.total(factors, signed @ self.shares, of_scale)
         dof = self.noise_dof(factors)
-        full = all(run.covariance.ndim == 2 for run in self.runs)
-        test = significance(
-            deviation, ReducedNoise(total if full else variances(total), self.q, dof)
-        )
+        tested, removed = total, self.q
+        if not all(run.covariance.ndim == 2 for run in self.runs):
+            tested = variances(total)
+            if of_scale:  # without correlations it would count at every node
+                tested = variances(self.total(factors, signed @ self.shares))
+                removed = np.column_stack([self.q, self.lengths.place])
+        noise = ReducedNoise(tested, removed, dof)
+        test = significance(noise.without(deviation), noise)
         e_n = np.zeros_like(deviation)
         expanded_u = coverage_factor(dof) * np.sqrt(variances(total))
         np.divide(deviation, expanded_u, out=e_n, where=expanded_u > 0)
@@ -608,6 +661,7 @@ class _Runs:
             return float("nan")
         power = (
             np.array([variances(run.covariance).sum() for run in self.runs])
+            + self.lengths.power
             + variances(between).sum()
         )
         squares = ((self.values - weights @ self.values) ** 2).sum(axis=1)
@@ -639,9 +693,8 @@ def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
 
 def _scatter_of_mean(family: _Family, weights: np.ndarray) -> np.ndarray:
     """Return the variances (d,) that the scatter of a family between runs gives the mean."""
-    return (
-        (weights**2).sum() * family.between + weights**2 @ family.within
-    ) * family.share
+    within = variances(family.within)
+    return ((weights**2).sum() * family.between + weights**2 @ within) * family.share
 
 
 def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> float:
@@ -718,21 +771,20 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
             "combine maps that overlap",
         )
     require_own_readings(members, common, scale=not keep_scale)
-    if keep_scale:
-        _require_one_text(members)
+    lengths = _lengths(members, first, known_sites) if keep_scale else None
     shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known_sites)}
     if lines.sum() > 1:
         angle_rad = 2 * np.pi * np.flatnonzero(lines) / len(lines)
         shapes["theta"] = fourier_basis(angle_rad, DEGREE)[:, 1:]
-    same_length = keep_scale and not _lengths_of_their_own(members)
     means = {
         kind: mean_of(
             [
-                _run(member, kind, common[kind], same_length=same_length)
+                _run(member, kind, common[kind], without_length=keep_scale)
                 for member in members
             ],
             datum_columns(first.artifact, kind, common[kind], scale=not keep_scale),
             of_kind,
+            lengths if kind == "xy" else None,
         )
         for kind, of_kind in shapes.items()
     }
@@ -742,39 +794,22 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     return Combination(result, known_sites, means["xy"], means.get("theta"))
 
 
-def _lengths_of_their_own(members: Sequence[Member]) -> bool:
-    """Return whether each run names another certificate of its length, with other numbers."""
-    lengths = [member.result.reference for member in members if member.result]
-    names, numbers = set(), set()
-    for length in filter(None, lengths):
-        stated = length.certified or length
-        names.add(length.certificate_key)
-        numbers.add((stated.relative_error, stated.u_relative))
-    return "" not in names and len(names) == len(numbers) == len(lengths)
-
-
-def _require_one_text(members: Sequence[Member]) -> None:
-    """Refuse runs that state one certificate with different numbers."""
-    first_of: dict[tuple, tuple[str, Certified]] = {}
-    for member in members:
-        length = member.result.reference if member.result else None
-        if length is None or length.certified is None or not length.certificate:
-            continue
-        name, before = first_of.setdefault(
-            (length.certificate_key, length.kind, length.marks),
-            (member.name, length.certified),
-        )
-        for number in ("relative_error", "u_relative", *CERTIFIED_WITH):
-            value, value_before = (
-                getattr(certified, number) for certified in (length.certified, before)
-            )
-            if not np.isclose(value, value_before, rtol=1e-9, atol=0.0):
-                raise InputError(
-                    member.name,
-                    f"{number} of the certificate '{length.certificate}' is {value:g}, and "
-                    f"{value_before:g} in {name}",
-                    "solve again with what it states; if it has several lengths, name them apart",
-                )
+def _lengths(
+    members: Sequence[Member], first: CalibrationResult, known_sites: np.ndarray
+) -> Lengths:
+    """Return the reference lengths of the runs, that of rechecks within their u."""
+    references = [
+        member.result.reference if member.result else None for member in members
+    ]
+    require_one_text([member.name for member in members], references)
+    lattice = first.artifact
+    return lengths_of(
+        [
+            None if member.result and member.result.recheck else reference
+            for member, reference in zip(members, references, strict=True)
+        ],
+        np.concatenate([lattice.x_m[known_sites], lattice.y_m[known_sites]]),
+    )
 
 
 def _checked(members: Sequence[Member], *, keep_scale: bool) -> CalibrationResult:
@@ -873,7 +908,7 @@ def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool
 
 
 def _run(
-    member: Member, kind: str, known_places: np.ndarray, *, same_length: bool
+    member: Member, kind: str, known_places: np.ndarray, *, without_length: bool
 ) -> RunValues:
     values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
     result = member.result
@@ -887,14 +922,18 @@ def _run(
     is_full = covariance.ndim == 2
     common = np.zeros_like(covariance)
     if kind == "xy":
-        factors = _common(result, known_places, same_length=same_length)
+        factors = _common(result, known_places)
         common = factors.T @ factors if is_full else (factors**2).sum(axis=0)
     elif (kept := behind(result)) is not None:
         of_lines = kept.terms_on_lines(known_places, _shared_terms(result))
         common = of_lines if is_full else np.diag(of_lines)
-    return RunValues(
-        values, covariance - common, common, True, result.noise.dof_of(kind)
-    )
+    covariance = covariance - common
+    if kind == "xy" and without_length and result.reference is not None:
+        at = result.artifact
+        length = np.concatenate([at.x_m[known_places], at.y_m[known_places]])
+        length *= result.reference.u_relative
+        covariance -= np.outer(length, length) if is_full else length**2
+    return RunValues(values, covariance, common, True, result.noise.dof_of(kind))
 
 
 def _part_beside_noise(result: CalibrationResult, kind: str) -> float:
@@ -929,26 +968,16 @@ def _shared_terms(result: CalibrationResult) -> list[str]:
     ]
 
 
-def _common(
-    result: CalibrationResult, known_sites: np.ndarray, *, same_length: bool
-) -> np.ndarray:
+def _common(result: CalibrationResult, known_sites: np.ndarray) -> np.ndarray:
     """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
-    Terms of the machine that are known from elsewhere, and the same reference length.
+    Terms of the machine that are known from elsewhere.
     """
     saved = factors_of(result)
     factors = saved.of_map[np.isin(saved.terms, _shared_terms(result))]
     factors = factors[:, :, known_sites]
     factors = factors.reshape(len(factors), 2 * int(known_sites.sum()))
-    factors = factors * np.nan_to_num(result.noise.sigma_xy)
-    if same_length and result.reference is not None:
-        lattice = result.artifact
-        place = (
-            np.concatenate([lattice.x_m[known_sites], lattice.y_m[known_sites]])
-            * result.reference.u_relative
-        )
-        factors = np.concatenate([factors, place[None]])
-    return factors
+    return factors * np.nan_to_num(result.noise.sigma_xy)
 
 
 def _polynomials(x: np.ndarray, y: np.ndarray, known_sites: np.ndarray) -> np.ndarray:

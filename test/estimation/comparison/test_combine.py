@@ -329,7 +329,7 @@ def of_scales(runs):
 
 
 def of_theta(run):
-    return _run(run, "theta", np.isfinite(run.error_map.g_theta), same_length=False)
+    return _run(run, "theta", np.isfinite(run.error_map.g_theta), without_length=False)
 
 
 def test_what_rechecks_share_does_not_average_out():
