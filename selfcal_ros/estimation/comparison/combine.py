@@ -739,7 +739,7 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     Differences of datum are removed first. The weight of a run is the inverse of its mean variance
     plus that between runs. What all runs of a machine share does not average out: the microscope,
     the scale of the lines and the approach as they are declared or assumed, and with `keep_scale`
-    the reference length, unless each run names a certificate of its own.
+    a certificate of all runs, and what temperatures add to their lengths.
 
     Parameters
     ----------
