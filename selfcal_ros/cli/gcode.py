@@ -25,7 +25,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.outputs import check_outputs
-from selfcal_ros.units import M_PER_UM
+from selfcal_ros.units import M_PER_UM, MM_PER_M
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -114,6 +114,13 @@ def run(args: argparse.Namespace) -> int:
     program = corrected_program(text, args.program, rewriter)
     (x0, *_, x1), (y0, *_, y1) = nodes(result.error_map, frame)
     lowest, highest = rewriter.reach_m
+    if rewriter.moves and (np.any(lowest > (x1, y1)) or np.any(highest < (x0, y0))):
+        raise InputError(
+            args.program,
+            f"all moves lie outside the field ({_span(np.array([x0, y0]), np.array([x1, y1]))}): "
+            f"{_span(lowest, highest)}",
+            "give the program's zero with --home-x and --home-y; check its unit (G20, G21)",
+        )
     warnings = [
         "moves leave the field, beyond which the correction at its edge is used, without U"
     ]
@@ -133,4 +140,13 @@ def run(args: argparse.Namespace) -> int:
         moves=rewriter.moves,
         pieces=rewriter.pieces,
         note=f", {rewriter.moves} moves as {rewriter.pieces}",
+    )
+
+
+def _span(lowest_m: np.ndarray, highest_m: np.ndarray) -> str:
+    """Return the extent of a field along x and y as text."""
+    ends_mm = MM_PER_M * np.stack([lowest_m, highest_m], axis=1)
+    return ", ".join(
+        f"{axis} from {low:.6g} to {high:.6g} mm"
+        for axis, (low, high) in zip("xy", ends_mm, strict=True)
     )

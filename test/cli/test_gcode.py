@@ -183,3 +183,23 @@ def test_moves_beyond_the_field_are_named(end, leaves, capsys):
     assert run("in.nc R.json -o o.nc") == 0
     assert ("in.nc: moves leave the field" in capsys.readouterr().err) == leaves
     assert ("; moves leave the field" in Path("o.nc").read_text()) == leaves
+
+
+@pytest.mark.parametrize(
+    ("program", "options", "span"),
+    [
+        ("G21 G90\nG0 X25 Y1\nG0 X70\n", "", "x from 25 to 70 mm, y from 1 to 1 mm"),
+        ("G20 G90\nG0 X-10 Y1\n", "", "x from -254 to -254 mm, y from 25.4 to 25.4 mm"),
+        (SAID + "G0 X0 Y0\n", "--home-y 0.5 --unit in", None),
+        (SAID + "G0 X0 Y0\n", "--home-y 25 --reverse-y", "y from 0 to 0 mm"),
+    ],
+)
+def test_a_program_that_never_enters_the_field_is_refused(
+    program, options, span, capsys
+):
+    """Its zero or its unit is another one: the edge's error would be nobody's."""
+    Path("in.nc").write_text(program)
+    assert run(f"in.nc R.json -o o.nc {options}") == (0 if span is None else 2)
+    said = capsys.readouterr().err
+    assert ("in.nc: all moves lie outside the field (x from " in said) == bool(span)
+    assert (span or "") in said and Path("o.nc").exists() == (span is None)
