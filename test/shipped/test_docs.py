@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros.bagio.messages.cdr import MAX_LENGTH
+from selfcal_ros.blocks import BUILT_IN, block_of
 from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.compensation.plausible import PLAUSIBLE, PLAUSIBLE_M
@@ -116,6 +117,25 @@ def test_plans_have_the_gains_that_the_table_states():
             more.append(100 * (large / middle - 1))
     bounds = [round(f(values)) for values in (less, more) for f in (min, max)]
     assert bounds == list(map(int, stated.groups()[:4]))
+
+
+def test_plans_are_judged_against_the_sizes_that_the_page_states():
+    stated = re.search(
+        r"TERM:SIZE`; default (\S+) µm, (\S+) µm for `drift`, (\S+) for `microscope`, (\S+) for ",
+        (ROOT / "docs/guides/identifiability.md").read_text(),
+    )
+    bending_um, drift_um, microscope, strain = map(float, stated.groups())
+    sizes = {
+        "plate_shape": bending_um / 1e6,
+        "approach": bending_um / 1e6,
+        "drift": drift_um / 1e6,
+        "microscope": microscope,
+        "plate_scale": strain,
+        "plate_strain": strain,
+    }
+    assert {name: block_of(name).nominal for name in sizes} == pytest.approx(sizes)
+    others = set(BUILT_IN) - set(sizes)
+    assert not any(block_of(name).nominal for name in others)
 
 
 METHOD = (ROOT / "docs/theory/method.md").read_text()
