@@ -42,6 +42,8 @@ LONGEST_WAIT_S = 3600.0
 """Longest wait for rest."""
 LONGEST_M = 20.0
 """Limits beyond are in another unit."""
+ASTRAY_M = 1.0
+"""Distance from the limits from which a position is in another unit: 5 mm read as 5 m."""
 PLACERS = ("person", "robot")
 NOT_OF_A_CELL = ("autostart", "hardware_id", "transport", "max_waiting", "frame_id")
 """Parameters of the node mark_detector that a cell does not have."""
@@ -131,6 +133,20 @@ class Cell:
     def to_stage(self, axis: str, value: float) -> float:
         """Return the position in the stage frame of a machine's position."""
         return value - self.origin.get(axis, 0.0)
+
+    def require_near(self, axis: str, value: float) -> None:
+        """Raise MachineError if the machine stands where only another unit can place it.
+
+        A small move from there, and an axis that is to stay, would go as many times as far.
+        """
+        low, high = self.limits.get(axis, (-math.inf, math.inf))
+        if axis != "theta" and max(low - value, value - high) > ASTRAY_M:
+            raise MachineError(
+                f"it stands at {axis} = {value:.6g} m, far beyond the limits {low:g} to "
+                f"{high:g}: is it in mm?",
+                f"{self.path}: limits",
+                "have the machine tell m, or correct the limits",
+            )
 
     def require_limits(
         self, axis: str, value: float, motion: str, start: float | None = None

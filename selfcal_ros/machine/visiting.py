@@ -420,6 +420,8 @@ class Visitor:
         last = self._last
         departure = self._where_it_was_left()
         start = departure.by_joint
+        for axis, value in start.items():
+            self.cell.require_near(axis, self.cell.to_machine(axis, value))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
             target = target | {

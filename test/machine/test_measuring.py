@@ -101,6 +101,23 @@ def test_a_stage_that_stands_beyond_the_limits_moves_back_towards_them(tmp_path)
             cell.require_limits("x", value, "a move", start=start)
 
 
+@pytest.mark.parametrize(
+    ("axis", "place_m"), [("x", (5e-3, 2e-6)), ("y", (2e-6, 5e-3))]
+)
+def test_a_stage_whose_position_is_in_mm_is_not_sent_thousands_of_them_back(
+    tmp_path, axis, place_m
+):
+    """At 5 mm it says 5; to stay there, or to move to 4.9999, would end at its stop."""
+    cell, machine = write_cell(tmp_path)
+    machine._position[:2] = place_m
+    spoilt = Spoilt(machine, "position in mm")
+    with pytest.raises(
+        MachineError, match=rf"at {axis} = 5\S* m, far beyond .*: is it in mm\?"
+    ):
+        run_of(tmp_path, spoilt, cell).measure()
+    assert not spoilt.moves
+
+
 def test_a_view_of_lines_needs_a_rotary_axis(tmp_path):
     cell, machine = write_cell(
         tmp_path, plan=PLAN.replace("angular_count: 0", "angular_count: 8")
