@@ -217,7 +217,8 @@ class StageMap(Compensator):
             raise InputError(
                 "covariance",
                 "the result does not contain the correlations of its sites",
-                "solve again with uncertainties; fields beyond 31 x 31 marks have none",
+                "solve again with uncertainties; fields beyond 31 x 31 marks (means and rechecks: "
+                "21 x 21), and means with maps from tables, have none",
             )
         # what has a sign of its own at each place has it between the sites as well
         of_each_place = variance_of_each_place(self.result).reshape(2, -1)[

@@ -8,12 +8,15 @@ import pytest
 
 from selfcal_ros.apply import load
 from selfcal_ros.cli.main import main
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.files import read_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.results import read_result
 from test.support.options import bare
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 
@@ -85,6 +88,10 @@ def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
     assert of_mean < of_one
     assert main(["combine", "mean.json", "1.json", "-o", "again.json"]) == 2
     assert "name these runs themselves" in capsys.readouterr().err
+    with pytest.raises(
+        InputError, match="of several runs, which has no map of a plate"
+    ):
+        known_plate(read_result("mean.json"), "mean.json")
 
 
 def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):

@@ -37,7 +37,7 @@ from selfcal_ros.model.findings import Finding, OtherPlate
 from selfcal_ros.model.pose import EDGE, PlacedPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.reference import CERTIFIED_WITH, ReferenceLength
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import COMBINED, CalibrationResult
 from selfcal_ros.units import MM_PER_M
 
 
@@ -201,11 +201,18 @@ def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPla
         If it is not qualified, or does not have what the plate's covariance needs; or as
         `reference_now`.
     """
+    otherwise = "or measure a plan that identifies the stage by itself"
     if result.recheck is not None:
         raise InputError(
             where,
             "is itself a recheck, which does not calibrate a plate",
-            f"name the calibration that it used, {result.recheck.of}",
+            f"name the calibration that it used, {result.recheck.of}, {otherwise}",
+        )
+    if result.method == COMBINED:
+        raise InputError(
+            where,
+            "is a mean of several runs, which has no map of a plate",
+            f"name the calibration of this plate, {otherwise}",
         )
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(
