@@ -127,8 +127,9 @@ def add_frame(
     theta: bool,
     default: bool = True,
     units: tuple[str, ...] = ("m", "mm", "um"),
+    origin: str = "the centre of the field",
 ) -> None:
-    """Add the options that relate the controller's axes to the stage frame."""
+    """Add the options that relate the controller's axes to the stage frame at `origin`."""
     group = parser.add_argument_group(
         "machine",
         None
@@ -172,7 +173,7 @@ def add_frame(
             metavar="P",
             default=None,
             help=f"position of the controller's zero in the stage frame, {unit} "
-            "(default 0, the centre of the field)",
+            f"(default 0, {origin})",
         )
         group.add_argument(
             f"--reverse-{axis}",

@@ -142,7 +142,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="replace files that exist; an old FILE.cal is kept with its date",
     )
-    add_frame(parser, theta=False)
+    add_frame(parser, theta=False, origin="the start of the first block")
     add_bag_options(parser)
     parser.add_argument(
         "-o",

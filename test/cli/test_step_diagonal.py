@@ -357,6 +357,14 @@ def recorded_bag(path, **options):
     )
 
 
+def test_the_help_states_from_where_positions_count(capsys):
+    with pytest.raises(SystemExit):
+        main(["step-diagonal", "--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "default 0, the start of the first block" in printed
+    assert "centre of the field" not in printed
+
+
 def test_a_bag_gives_the_same_as_the_table_of_its_blocks(tmp_path, capsys):
     bag, table = recorded_bag(tmp_path / "bag"), tmp_path / "blocks.csv"
     out, again = tmp_path / "a.json", tmp_path / "b.json"
