@@ -325,7 +325,10 @@ class SequencingSession:
             missing = (
                 missing_marks(status) or "nothing, but it is not reported complete"
             )
-            line = f"view '{name}' stalls at {100 * self.coverage:.1f} %: missing {missing}"
+            line = (
+                f"view '{name}' stalls with {100 * self.coverage:.1f} % of its marks complete: "
+                f"missing {missing}"
+            )
         collector = self.presence.of("measurement_collector")
         if collector is None:
             return line + "; measurement_collector gives no sign of life"

@@ -397,8 +397,8 @@ def test_a_view_that_stalls_names_its_missing_marks(measuring, seconds, said):
     measuring.hands.pass_time(seconds)
     measuring.session.tick()
     line = (
-        "view '0' stalls at 92.0 %: missing 2 marks: (-2, 0), (1, 2); measurement_collector "
-        "gives no sign of life"
+        "view '0' stalls with 92.0 % of its marks complete: missing 2 marks: (-2, 0), (1, 2); "
+        "measurement_collector gives no sign of life"
     )
     assert measuring.hands.lines(Level.WARN) == [line] * said
     assert measuring.session.diagnosis().level == (Level.WARN if said else Level.OK)
@@ -412,8 +412,8 @@ def test_check_stops_that_are_missing_count_and_are_named(measuring):
     measuring.hands.pass_time(5.0)
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [
-        "view '0' stalls at 93.3 %: missing check stops of 2 marks (see check_marks of the view "
-        "command); measurement_collector gives no sign of life"
+        "view '0' stalls with 93.3 % of its marks complete: missing check stops of 2 marks (see "
+        "check_marks of the view command); measurement_collector gives no sign of life"
     ]
 
 
