@@ -247,10 +247,14 @@ class PredictionFailed(Finding):
 
 @dataclass(frozen=True, kw_only=True)
 class BetweenRuns(Finding):
-    """Combined runs differ in a quantity (``xy``, ``theta``) by more than their uncertainties."""
+    """Combined runs differ in a quantity (``xy``, ``theta``) by more than their uncertainties.
+
+    `of_scale`: whether nearly all of it is their scale.
+    """
 
     runs: int
     quantity: str
+    of_scale: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -303,6 +303,8 @@ class Mean:
         shared, if nearly all that runs differ by is the amplitude of a single shape.
     deviations : tuple of Deviation
         Of each run.
+    is_of_scale : bool
+        Whether nearly all that runs differ by is their scale.
     """
 
     values: np.ndarray
@@ -315,6 +317,7 @@ class Mean:
     weights: np.ndarray
     dof: float
     deviations: tuple[Deviation, ...]
+    is_of_scale: bool
 
     @property
     def u(self) -> np.ndarray:
@@ -504,6 +507,10 @@ def mean_of(
         added = (shapes * of_shapes) @ shapes.T + of_rest * (
             np.eye(len(q)) - q @ q.T - shapes @ shapes.T
         )
+    of_scale = sum(
+        family.between * float(shape @ place) ** 2
+        for family, shape in zip(families, shapes.T, strict=False)
+    )
     p = together.p_between(families)
     of_one = max(
         families[: shapes.shape[1]], key=lambda family: family.between, default=None
@@ -523,6 +530,7 @@ def mean_of(
         weights=weights,
         dof=dof,
         deviations=tuple(together.deviation(i, added) for i in range(len(runs))),
+        is_of_scale=bool(of_scale > SINGLE * spread.sum() * (place @ place)),
     )
 
 
@@ -1150,6 +1158,7 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
                     p=mean.p_between,
                     runs=len(members),
                     quantity=kind,
+                    of_scale=mean.is_of_scale,
                 )
             )
         enlarged += _of_runs(members, kind, mean)

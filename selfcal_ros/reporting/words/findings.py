@@ -412,10 +412,16 @@ def _(finding: PredictionFailed) -> str:
 @sentence_of.register
 def _(finding: BetweenRuns) -> str:
     unit = UM if finding.unit == "m" else ARCSEC
+    scale = (
+        "; nearly all of it is their scale: compare the certificates, and the temperatures of "
+        "plate and encoders"
+        if finding.of_scale
+        else ""
+    )
     return (
         f"the {finding.runs} runs differ by more than their uncertainties: a variation of "
         f"{finding.size * unit.per_si:.3g} {unit.name} (rms) between runs, {p_text(finding.p)}, "
-        "is in U"
+        f"is in U{scale}"
     )
 
 

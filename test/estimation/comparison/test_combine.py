@@ -616,6 +616,8 @@ def test_magnifications_that_differ_have_one_degree_of_freedom():
     runs[1] = part("warmer", replace(runs[1].result, error_map=warmer))
     found = combine(runs, keep_scale=True)
     assert found.result.verdict.grade is Grade.ENLARGED
+    of_scale = "is their scale: compare the certificates, and the temperatures of plate"
+    assert of_scale in worded(found.result).verdict.sentence
     assert found.result.noise.k_xy == pytest.approx(coverage_factor(1.0), rel=1e-3)
     place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()])
     assert np.corrcoef(found.xy.between, place**2)[0, 1] > 0.999
