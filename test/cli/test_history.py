@@ -39,9 +39,8 @@ def write(path, *, day=0, bow_m=0.0, noise_m=1e-9, **changes):
     )
     result = calibrate(readings, Options())
     when = (BEGAN + timedelta(days=day)).isoformat()
-    result = replace(
-        result, provenance=replace(result.provenance, first_exposure=when), **changes
-    )
+    times = replace(result.provenance, first_exposure=when, last_exposure=when)
+    result = replace(result, provenance=times, **changes)
     write_json(path, result_to_dict(result))
     return path
 
@@ -104,6 +103,35 @@ def test_the_next_is_due_when_the_drift_reaches_u(folder, capsys):
     assert (due - BEGAN).total_seconds() / 86400 == pytest.approx(
         limit / drift["per_day_m"], abs=1e-3
     )
+
+
+def test_a_mean_is_of_the_middle_of_its_runs_which_are_no_checks_of_it(folder, capsys):
+    """Active: the drift is that of the later check alone, from the middle on."""
+    for day in (0, 8, 24):
+        write(
+            folder / f"{day}.json",
+            day=day,
+            bow_m=day * 2e-8,
+            noise_m=2e-8,
+            input={"file": "bag", "sha256": f"{day:064x}"},
+        )
+    runs = [str(folder / f"{day}.json") for day in (0, 8)]
+    assert main(["combine", *runs, "-o", str(folder / "mean.json")]) == 0
+    assert main(["history", str(folder), "--activate", "mean.json"]) == 0
+    capsys.readouterr()
+    found = told(folder, capsys)
+    assert [entry["kind"] for entry in found["entries"]] == [
+        "calibration",
+        "mean",
+        "calibration",
+        "calibration",
+    ]
+    _, mean, second, _ = found["entries"]
+    assert mean["measured"].startswith("2026-03-05T08:00")
+    assert mean["not_compared"] == "a mean and one of its runs"
+    assert second["change_rms_m"] > 0  # from the calibration before the mean
+    per_day = 2e-8 * np.sqrt(np.mean(((ARTIFACT.m / 2.0) ** 2 - 0.5) ** 2) / 2)
+    assert found["drift"]["per_day_m"] == pytest.approx(per_day, rel=0.2)
 
 
 def test_without_drift_it_is_not_due_before_one_could_have_been_missed(folder, capsys):

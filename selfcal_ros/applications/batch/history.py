@@ -31,7 +31,8 @@ class Entry:
     result : CalibrationResult
         Its content.
     measured : datetime
-        First exposure, or when it was computed if that is not known.
+        First exposure, or when it was computed if that is not known; of a mean the middle from the
+        first exposure of its runs to the last.
     change : MapDifference or str
         Against the one before; why it was not compared, "" for the first.
     """
@@ -125,7 +126,7 @@ def history(folder: Path) -> list[Entry]:
             entry.path,
             entry.result,
             entry.measured,
-            _change(entries[max(number - 1, 0)], entry),
+            _change(_one_before(entries[:number], entry), entry),
         )
         for number, entry in enumerate(entries)
     ]
@@ -141,27 +142,54 @@ def _is_result(path: Path) -> bool:
 
 def _measured(result: CalibrationResult, where: str) -> datetime:
     provenance = result.provenance
-    text = provenance.first_exposure or provenance.created
+    texts = [provenance.first_exposure or provenance.created]
+    if result.parts.combined and provenance.last_exposure:
+        texts.append(provenance.last_exposure)
     try:
-        when = datetime.fromisoformat(str(text))
+        times = [datetime.fromisoformat(str(text)) for text in texts]
     except ValueError:
         raise InputError(
             where,
             "it does not tell when it was measured",
             "solve its bag again, or take it out of the folder",
         ) from None
-    return when if when.tzinfo else when.replace(tzinfo=UTC)
+    zoned = [time if time.tzinfo else time.replace(tzinfo=UTC) for time in times]
+    first, last = zoned[0], zoned[-1]
+    return first + (last - first) / 2
+
+
+def _one_before(earlier: Sequence[Entry], entry: Entry) -> Entry:
+    """Return the entry before another: the last that is independent of it, if one is."""
+    for before in reversed(earlier):
+        if not _share_run(before.result, entry.result):
+            return before
+    return earlier[-1] if earlier else entry
 
 
 def _change(before: Entry, entry: Entry) -> MapDifference | str:
     if before is entry:
         return ""
+    if _share_run(before.result, entry.result):
+        return "a mean and one of its runs"
     try:
         return compare(
             before.result, entry.result, names=(str(before.path), str(entry.path))
         )
     except InputError as error:  # another lattice, or nothing that both know
         return error.what
+
+
+def _share_run(first: CalibrationResult, second: CalibrationResult) -> bool:
+    """Return whether one of two results is a mean with a run that is, or is in, the other."""
+    if not (first.parts.combined or second.parts.combined):
+        return False
+    in_first, in_second = (
+        {run.sha256 for run in result.parts.combined.runs}
+        if result.parts.combined
+        else {result.input.get("sha256", "")}
+        for result in (first, second)
+    )
+    return bool(in_first & in_second - {""})
 
 
 def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
