@@ -4,6 +4,7 @@
 import json
 import re
 from importlib.metadata import requires
+from math import radians
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.compensation.plausible import PLAUSIBLE, PLAUSIBLE_M
 from selfcal_ros.estimation.observability.plan_check import predict_plan
 from selfcal_ros.files import MAX_JSON_VALUES, MAX_YAML_BYTES, MAX_YAML_NODES
-from selfcal_ros.model.artifact import MAX_GRID_SIZE, Artifact
+from selfcal_ros.model.artifact import MAX_GRID_SIZE, Artifact, MapGrid
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import MAX_VIEWS
+from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes.sessions.compensating import LARGEST_FILE, LEAST_RADIUS_M
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.settings.nodes import CompensatorSettings
@@ -139,6 +141,33 @@ def test_plans_are_judged_against_the_sizes_that_the_page_states():
 
 
 METHOD = (ROOT / "docs/theory/method.md").read_text()
+ANGULAR = re.compile(
+    r"K = (24): (\S+) σ \(`xy_axes`\), (\S+) σ \(`zero_mean`\); K =\s(72): (\S+) σ, (\S+) σ"
+)
+SERIES = re.compile(
+    r"101°\} has (\S+) σ for K = (\d+), H = (\d+), (\S+) for K = (\d+), H = (\d+), "
+    r"(\S+) for K = (\d+), H = (\d+)"
+)
+
+
+def test_angular_maps_have_the_gains_that_the_method_states():
+    lines = ANGULAR.search(METHOD).groups()
+    for count, *stated in (lines[:3], lines[3:]):
+        plan = plan_of("0,90,tx", Artifact(11, 0.01, int(count)), lines=1)
+        for datum, gain in zip(("xy_axes", "zero_mean"), stated, strict=True):
+            predicted = predict_plan(plan, ThetaDatum(datum))
+            assert predicted.rms_theta == pytest.approx(float(gain), abs=6e-4)
+    series = SERIES.search(METHOD).groups()
+    for gain, count, harmonics in (series[:3], series[3:6], series[6:]):
+        nodes = MapGrid(4, 0.04 / 3)
+        plate = Artifact(5, 0.01, int(count), map_grid=nodes, harmonics=int(harmonics))
+        turned = [View(f"{turn}", radians(turn)) for turn in (0, 37, 101)]
+        shifted = View("shifted", translation_m=(0.01, 0.0), angular=False)
+        plan = Plan("series", plate, (*turned, shifted))
+        predicted = predict_plan(plan, ThetaDatum.ZERO_MEAN)
+        assert predicted.rms_theta == pytest.approx(float(gain), abs=6e-3)
+
+
 CITED = re.compile(r"method eqs?\. (\d+\.\d+)(?:(-|, )(\d+\.\d+))?")
 
 
