@@ -31,7 +31,7 @@ from selfcal_ros.collection.marks.seen_poses import (
     texts,
 )
 from selfcal_ros.collection.marks.stops import places_of_cells
-from selfcal_ros.collection.reduce import displacement_seen
+from selfcal_ros.collection.reduce import UnnamedImages
 from selfcal_ros.estimation.checks.placing import Misplaced
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
@@ -144,8 +144,8 @@ class DetectionsSeen:
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
-        if rejected.keys() & set(PLACED):
-            poses |= self._unnamed(views, marks)
+        images = self._unnamed(views, marks) if rejected.keys() & set(PLACED) else {}
+        poses |= self._poses_of(images)
         faults = texts(poses)
         joints = not any(pose.planned for pose in poses.values())
         session = self._evidence(
@@ -162,7 +162,8 @@ class DetectionsSeen:
             main_reason(*counts, placed=True)
             for counts in ((rejected, used), *of_views)
         ):
-            late = self._late(self._lag(views), poses, session)
+            late = _late_images(images.values())
+            late = late or self._late(self._lag(views), poses, session)
             session = replace(session, late=late)
         finding = diagnose(session)
         named: dict[int | None, RejectionFinding] = {}
@@ -190,24 +191,34 @@ class DetectionsSeen:
 
     def _unnamed(
         self, views: Mapping[int, ViewReadings], marks: Mapping[int, NamedMarks]
-    ) -> dict[int, SeenPose]:
+    ) -> dict[int, UnnamedImages]:
+        """Return view_index -> images without ids."""
+        return {
+            index: UnnamedImages.of(
+                self.artifact,
+                readings.view,
+                self.table[self.view_of == index],
+                self.exposures,
+                self.rules,
+                self.sense,
+            )
+            for index, readings in views.items()
+            if readings.view.image and readings.view.grid and index not in marks
+        }
+
+    def _poses_of(self, images: Mapping[int, UnnamedImages]) -> dict[int, SeenPose]:
         """Return view_index -> where images without ids show the plate, of views that show it."""
         poses = {}
-        for index, readings in views.items():
-            view = readings.view
-            if view.image is None or not view.grid or index in marks:
-                continue
-            table = self.table[self.view_of == index]
-            shift = displacement_seen(
-                self.artifact, view, table, self.exposures, self.rules, self.sense
-            )
+        for index, of_view in images.items():
+            shift = of_view.displacement()
             if shift is None:
                 continue
-            pose = view.on_stage(self.artifact)
+            pose = of_view.view.on_stage(self.artifact)
             x, y = pose.shift
             lies = (round(x + shift.real, 1), round(y + shift.imag, 1))
+            as_planned = Misplaced.of(of_view.view.name, pose, pose)
             poses[index] = SeenPose(
-                replace(Misplaced.of(view.name, pose, pose), found_shift=lies),
+                replace(as_planned, found_shift=lies),
                 planned=not shift,
                 mirrored=False,
                 named=False,
@@ -385,6 +396,22 @@ class DetectionsSeen:
                 listed=self.artifact.marks is not None,
             )
         return named_marks
+
+
+def _late_images(images: Iterable[UnnamedImages]) -> str:
+    """Return of which other exposures images are, and the remedy; empty if of none."""
+    for of_view in images:
+        late, seconds = of_view.late()
+        if late:
+            side = "before" if late > 0 else "after"
+            exposures = "exposure" if abs(late) == 1 else "exposures"
+            return (
+                f"each image was taken {abs(late)} {exposures} {side} its stamp, about "
+                f"{seconds:.2g} s, as the marks that it lacks at the edges of the plate show; "
+                "stamp the image of each exposure with its own instant, and read none that "
+                "the camera kept"
+            )
+    return ""
 
 
 def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[int]:

@@ -331,6 +331,15 @@ def _identified(
     if view.image is None or not np.isin(assignment.reasons, DISPLACED).any():
         return assignment, number
     offset = np.stack([d["offset_x"], d["offset_y"]])
+    places_m = (
+        _reading(rules.sense, position, offset),
+        _reading(rules.sense, position, 0.0),
+    )
+    if not d["has_id"].any() and images_late(
+        artifact, view, d, assignment.rigid, places_m
+    ):
+        assignment.reasons[:] = Reason.NOT_AT_MARK
+        return assignment, number
     named = d["has_id"] & (assignment.reasons != Reason.UNKNOWN_MARK)
     marks = artifact.places(d["m"][named], d["n"][named])
     away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
@@ -386,54 +395,157 @@ def displacement(
     return _on_stage(artifact, view, map(stops.middle_of, rows, artifact.shape))
 
 
-def displacement_seen(
+@dataclass(frozen=True, eq=False)
+class UnnamedImages:
+    """Marks without ids of a view with images: where they and the stage are, (2, n), m."""
+
+    artifact: Artifact
+    view: View
+    detections: np.ndarray
+    rigid: Rigid
+    reading_m: np.ndarray
+    stage_m: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        artifact: Artifact,
+        view: View,
+        detections: np.ndarray,
+        exposures: Exposures,
+        rules: identify.IdentityRules,
+        sense: Sense,
+    ) -> "UnnamedImages":
+        """Return those of a view whose stage positions are known."""
+        grid = detections[detections["kind"] == Kind.GRID]
+        stage = exposures.at(grid["stamp"])
+        usable = (stage.x.code == GOOD) & (stage.y.code == GOOD)
+        position = np.stack([stage.x.position, stage.y.position])[:, usable]
+        grid = grid[usable]
+        offset = np.stack([grid["offset_x"], grid["offset_y"]])
+        reading_m = _reading(sense, position, offset)
+        marks = identify.identify_grid(
+            artifact,
+            view,
+            reading_m,
+            ids=np.zeros(reading_m.shape, dtype=np.int64),
+            has_id=np.zeros(len(grid), dtype=bool),
+            rules=rules,
+        )
+        stage_m = _reading(sense, position, 0.0)
+        return cls(artifact, view, grid, marks.rigid, reading_m, stage_m)
+
+    def displacement(self) -> complex | None:
+        """Return by how many pitches they show the plate beside its place, stage frame.
+
+        Of several places that where the images lack the fewest marks; None if marks are seen
+        beside the plate at each.
+        """
+        if not len(self.detections):
+            return None
+        middles, beside = _middles_seen(
+            self.artifact, self.view, self.rigid, self.reading_m, self.stage_m
+        )
+        if 4 * max(self.artifact.shape) * beside > len(self.detections):
+            return None
+        whole = _on_stage(self.artifact, self.view, middles)
+        part = complex(self.rigid.tx_m, self.rigid.ty_m) / self.artifact.grid_pitch_m
+        return whole + (part if whole and abs(part) > NEARLY_WHOLE else 0)
+
+    def late(self) -> tuple[int, float]:
+        """Return by how many exposures, and s, they are late; 0 if they are not."""
+        places_m = self.reading_m, self.stage_m
+        late = images_late(
+            self.artifact, self.view, self.detections, self.rigid, places_m
+        )
+        stamps = np.unique(self.detections["stamp"])
+        by = abs(late)
+        return late, float(np.median(stamps[by:] - stamps[: len(stamps) - by])) * 1e-9
+
+
+def _middles_seen(
     artifact: Artifact,
     view: View,
-    detections: np.ndarray,
-    exposures: Exposures,
-    rules: identify.IdentityRules,
-    sense: Sense,
-) -> complex | None:
-    """Return by how many pitches images without ids show the plate beside its place, stage frame.
-
-    Of several places that where the images lack the fewest marks; None if marks are seen beside
-    the plate at each.
-    """
-    grid = detections[detections["kind"] == Kind.GRID]
-    stage = exposures.at(grid["stamp"])
-    usable = (stage.x.code == GOOD) & (stage.y.code == GOOD)
-    position = np.stack([stage.x.position, stage.y.position])[:, usable]
-    grid = grid[usable]
-    if not len(grid):
-        return None
-    reading = _reading(sense, position, np.stack([grid["offset_x"], grid["offset_y"]]))
-    rigid = identify.identify_grid(
-        artifact,
-        view,
-        reading,
-        ids=np.zeros(reading.shape, dtype=np.int64),
-        has_id=np.zeros(len(grid), dtype=bool),
-        rules=rules,
-    ).rigid
-    rows = _rows_at(artifact, view, rigid, reading)
-    stage_rows = _rows_at(artifact, view, rigid, _reading(sense, position, 0.0))
+    rigid: Rigid,
+    reading_m: np.ndarray,
+    stage_m: np.ndarray,
+) -> tuple[list[int], int]:
+    """Return where, m and n, the images lack the fewest marks, and how many are beside it."""
     steps = [cell.step_on_plate(artifact) for cell in view.sub_views]
-    middles = []
+    middles, most = [], 0
     for row, side, stage_row, step in zip(
-        rows, artifact.shape, stage_rows, zip(*steps, strict=True), strict=True
+        _rows_at(artifact, view, rigid, reading_m),
+        artifact.shape,
+        _rows_at(artifact, view, rigid, stage_m),
+        zip(*steps, strict=True),
+        strict=True,
     ):
         visible = int(stage_row.min()) + min(step), int(stage_row.max()) + max(step)
         middle = stops.middle_of(row, side, visible=visible)
         first = middle - side // 2
-        beside = (row < first) | (row >= first + side)
-        if 4 * side * beside.sum() > len(row):
-            return None
+        most = max(most, int(((row < first) | (row >= first + side)).sum()))
         middles.append(middle)
-    whole = _on_stage(artifact, view, middles)
-    part = complex(rigid.tx_m, rigid.ty_m) / artifact.grid_pitch_m
-    return whole + (part if whole and abs(part) > NEARLY_WHOLE else 0)
+    return middles, most
 
 
+def images_late(
+    artifact: Artifact,
+    view: View,
+    d: np.ndarray,
+    rigid: Rigid,
+    readings_m: tuple[np.ndarray, np.ndarray],
+) -> int:
+    """Return by how many exposures images without ids are late, 0 if they are not.
+
+    Which cells show a mark tells at which stops near the edge of the plate an image was taken.
+
+    Parameters
+    ----------
+    artifact, view
+        The plate and its pose.
+    d : structured array (n,)
+        Detections.
+    rigid : Rigid
+        The plate's own motion.
+    readings_m : tuple of float array (2, n)
+        Places of the marks, and of the stage.
+    """
+    offset = np.stack([d["offset_x"], d["offset_y"]])
+    number = stops.numbers_of(view, stops.cells_of(view, offset))
+    _, first, image = np.unique(d["stamp"], return_index=True, return_inverse=True)
+    if len(first) < LEAST_IMAGES:
+        return 0
+    seen = np.zeros((len(first), len(view.sub_views)), dtype=bool)
+    seen[image[number >= 0], number[number >= 0]] = True
+    at = _rows_at(artifact, view, rigid, readings_m[1][:, first])
+    steps = [cell.step_on_plate(artifact) for cell in view.sub_views]
+
+    def fitting(middles: Sequence[int], late: int = 0) -> float:
+        expected = np.ones_like(seen)
+        for row, side, middle, step in zip(
+            at, artifact.shape, middles, zip(*steps, strict=True), strict=True
+        ):
+            from_first = row[:, None] + np.array(step) - (middle - side // 2)
+            expected &= (from_first >= 0) & (from_first < side)
+        ends = slice(max(late, 0), len(seen) + min(late, 0))
+        return float((seen == np.roll(expected, late, axis=0)).all(axis=1)[ends].mean())
+
+    planned = fitting((0, 0))
+    if planned > ALL_FIT:
+        return 0
+    displaced = fitting(_middles_seen(artifact, view, rigid, *readings_m)[0])
+    by_late = {late: fitting((0, 0), late) for late in LATE_IMAGES}
+    best = max(by_late, key=lambda late: by_late[late])
+    return best if by_late[best] > max(displaced, planned) + CLEARLY else 0
+
+
+LEAST_IMAGES = 20
+"""Images that show whether they are late."""
+LATE_IMAGES = (1, -1, 2, -2, 3, -3)
+"""Exposures by which images may be late: a camera gives the one before."""
+ALL_FIT, CLEARLY = 0.95, 0.05
+"""Part of the images that fit the stops of their stamps from which none is late, and how many more
+fit the stops of other stamps if they are. Marks that are not detected lessen both."""
 NEARLY_WHOLE = 0.25
 """Part of a pitch up to which a plate is said to lie at a whole one."""
 

@@ -315,6 +315,22 @@ def test_images_of_wrong_joints_show_no_plate_beside_its_place(change):
     assert "shifted" not in " ".join(findings(with_positions(cell, change)).values())
 
 
+@pytest.mark.parametrize("by", [1, -1, 2])
+@pytest.mark.parametrize("size", [6, 7])
+def test_images_of_another_exposure_are_named(size, by):
+    """A camera gives the image before: each shows other marks on the lattice, which fit."""
+    cell = photographed(in_images(size), {})
+    rng = np.random.default_rng(1)
+    cell.detections = [d for d in cell.detections if rng.uniform() > 0.02]
+    stamps = np.unique([detection.stamp_ns for detection in cell.detections])
+    exposure = int(np.median(np.diff(stamps)))
+    late = stamped_late(cell, by * exposure / S)
+    measured = gathered(late.events).collect()[0]
+    assert not any(view.used for view in measured.views)
+    taken = f"taken {abs(by)} exposure{'s' * (abs(by) > 1)} {'before' if by > 0 else 'after'}"
+    assert f"each image was {taken} its stamp, about" in findings(late.events)[None]
+
+
 def in_images(size):
     """Return a cell of which each image shows nine marks, the last view shifted by a pitch."""
     plan = image_plan(size, turns=(0, 90, 180))
