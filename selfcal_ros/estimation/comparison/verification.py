@@ -89,6 +89,8 @@ class Verification:
         Test of the error that remains in x and y.
     gx, gy, g_theta : float array
         Map with the correction on, in the datum of the map before, m and rad.
+    without_scale : bool
+        Whether the map before has a scale, which is not in any of these figures.
     """
 
     better: bool
@@ -101,6 +103,7 @@ class Verification:
     gx: np.ndarray
     gy: np.ndarray
     g_theta: np.ndarray
+    without_scale: bool = False
 
     @property
     def passed(self) -> bool:
@@ -346,6 +349,7 @@ def verify(
         gx=gx,
         gy=gy,
         g_theta=g_theta,
+        without_scale=before.reference is not None and after.reference is None,
     )
 
 

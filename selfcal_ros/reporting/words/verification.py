@@ -117,6 +117,8 @@ def _why(verification: Verification) -> list[str]:
     theta = verification.axes.get("theta")
     if theta is not None and verification.theta_fault is not TableFault.NONE:
         clauses.append(_of_theta(verification.theta_fault, theta))
+    if verification.without_scale:
+        clauses.append("the scale of the map, by its reference length, is not compared")
     return clauses
 
 

@@ -11,6 +11,7 @@ from selfcal_ros.estimation.comparison.verification import (
     require_correctable,
     verify,
 )
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.verification import verification_sentence
@@ -39,6 +40,21 @@ def test_the_sentence_names_what_acts(wiring):
         if wiring in ("right", "sign", "unit", "off"):
             for axis in found.axes.values():
                 assert abs(axis.factor - factor) < 5 * axis.u_factor
+
+
+def test_a_scale_that_one_map_has_alone_is_said_to_be_left_out():
+    """A stage that is warmer with the correction on was as the map says, 24 µm/m off it."""
+    before, after, _ = machine(0, "right")
+    length = ReferenceLength("artifact", 1e-6, 2e-7, "PTB 1")
+    scaled = replace(before, reference=length)
+    left_out = "the scale of the map, by its reference length, is not compared"
+    for first, second, said in (
+        (before, after, False),
+        (scaled, after, True),
+        (scaled, replace(after, reference=length), False),
+    ):
+        sentence = verification_sentence(verify(first, second))
+        assert (left_out in sentence) is said
 
 
 @pytest.mark.parametrize("seed", [3, 5, 13])
