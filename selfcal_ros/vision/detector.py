@@ -318,19 +318,24 @@ class MarkDetector:
         inside = rejected - Counter({str(MarkFault.CUT_OFF): cut_off})
         most = next((reason for reason, _ in inside.most_common(1)), "")
         spots = None if picture is None else spots_in(picture.values)
+        repeats = (
+            "nothing repeats in them"
+            if spots is None
+            else f"what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+        )
+        what = f"{summary}; {repeats}"
+        if picture is not None and alternates(picture.values):
+            return (
+                what,
+                "let the camera give grey or colour images, not a Bayer pattern",
+            )
         if spots is None:
-            return f"{summary}; nothing repeats in them", REMEDIES.get(
+            return what, REMEDIES.get(
                 most,
                 "let whole marks lie in the image, half their size free around them; "
                 "check exposure and focus"
                 if cut_off and not inside
                 else "check exposure and focus",
-            )
-        what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
-        if picture is not None and alternates(picture.values):
-            return (
-                what,
-                "let the camera give grey or colour images, not a Bayer pattern",
             )
         if most in REMEDIES:
             return what, REMEDIES[most]

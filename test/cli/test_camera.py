@@ -287,7 +287,7 @@ def test_images_without_the_mark_say_what_they_show(tmp_path, capsys, options, s
         (lambda v: np.clip(2.0 * v, 0, 255), "saturated", "; expose shorter, and"),
         (
             lambda v: v * MOSAIC,
-            "px, dark",
+            "was found",
             "; let the camera give grey or colour images",
         ),
         (lambda v: noise(v, 4) + 100, "was found; nothing", "; check exposure and foc"),
