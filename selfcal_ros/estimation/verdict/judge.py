@@ -60,7 +60,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
     with_coverage,
 )
-from selfcal_ros.estimation.verdict.undetermined import undetermined_effects
+from selfcal_ros.estimation.verdict.undetermined import with_undetermined_terms
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.findings import (
     ApproachUnknown,
@@ -115,6 +115,9 @@ def judged(
     advise : bool
         Whether remedies of causes are tried.
     """
+    solved, options, undetermined = with_undetermined_terms(
+        solved, measurements, options
+    )
     noises = list(_noise_findings(solved))
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     is_same = checked is solved
@@ -133,7 +136,7 @@ def judged(
     result = with_coverage(
         enlarged(
             replace(solved.result, reference=options.reference),
-            [*effects, *undetermined_effects(solved, options)],
+            [*effects, *undetermined],
         )
     )
     bounded = (

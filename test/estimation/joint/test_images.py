@@ -416,7 +416,10 @@ def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():
         plan.artifact, 3, rng, Spread(phi_rad=0.003, correlation_pitches=4.0)
     )
     settings = CellSettings(sigma_xy_m=MARK, image_xy_m=MARK, servo_sigma_m=0.0)
-    found = calibrate(simulate_measurements(truth, plan, rng, settings=settings))
+    found = calibrate(
+        simulate_measurements(truth, plan, rng, settings=settings),
+        Options(terms=tuple(ModelTerm(name, 0.0) for name in ("drift", "approach"))),
+    )
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]
     for u in (
         found.error_map.u_gx,
