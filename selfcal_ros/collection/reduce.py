@@ -458,6 +458,8 @@ class UnnamedImages:
         late = images_late(
             self.artifact, self.view, self.detections, self.rigid, places_m
         )
+        if not late:
+            return 0, 0.0
         stamps = np.unique(self.detections["stamp"])
         by = abs(late)
         return late, float(np.median(stamps[by:] - stamps[: len(stamps) - by])) * 1e-9

@@ -315,6 +315,21 @@ def test_images_of_wrong_joints_show_no_plate_beside_its_place(change):
     assert "shifted" not in " ".join(findings(with_positions(cell, change)).values())
 
 
+@pytest.mark.parametrize("unit", [1e6, 1e9])
+def test_images_of_joints_in_another_unit_are_diagnosed_in_little_memory(unit):
+    cell = photographed(in_images(5), {})
+    found = findings(with_positions(cell, lambda x, y: (unit * x, unit * y)))
+    assert found and "shifted" not in " ".join(found.values())
+
+
+def test_a_view_that_is_not_measured_yet_is_not_late():
+    cell = photographed(in_images(5), {1: 1})
+    stamps = sorted(detection.stamp_ns for detection in cell.detections)
+    end = stamps[len(stamps) * 2 // 3]
+    cell.detections = [d for d in cell.detections if d.stamp_ns < end]
+    assert "plate lies shifted" in findings(cell.events)[1]
+
+
 @pytest.mark.parametrize("by", [1, -1, 2])
 @pytest.mark.parametrize("size", [6, 7])
 def test_images_of_another_exposure_are_named(size, by):

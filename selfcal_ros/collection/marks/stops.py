@@ -106,17 +106,15 @@ def middle_of(
     window_count = np.convolve(
         np.append(count, np.zeros(width, int)), np.ones(width, int), mode="valid"
     )
-    best = (
-        np.arange(len(window_count))[
-            window_count >= window_count.max() - len(numbers) / (4 * width)
-        ]
-        + low
-        + width // 2
+    first = np.flatnonzero(
+        window_count >= window_count.max() - len(numbers) / (4 * width)
     )
+    best = first + low + width // 2
     if visible is not None:
-        unseen = np.setdiff1d(np.arange(visible[0], visible[1] + 1), numbers)
-        after_first = unseen - (best[:, None] - width // 2)
-        lacking = ((after_first >= 0) & (after_first < width)).sum(axis=1)
+        number = low + np.arange(len(count) + width)
+        unseen = (number >= visible[0]) & (number <= visible[1])
+        unseen[: len(count)] &= count == 0
+        lacking = np.convolve(unseen, np.ones(width, int), mode="valid")[first]
         best = best[lacking == lacking.min()]
         return int(best[np.abs(best).argmin()])
     middle = (
