@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import equations_of
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE
@@ -52,8 +53,12 @@ def with_undetermined_terms(
     n_coefficients = len(term_columns(problem.inputs, more).columns)
     if problem.system.dof_grid - n_coefficients < ENOUGH_DOF:
         return solved, options, effects
-    options = replace(options, assumed=(*options.assumed, *more))
-    return solve_joint(measurements, options), options, ()
+    assuming_more = replace(options, assumed=(*options.assumed, *more))
+    try:
+        with_more = solve_joint(measurements, assuming_more, whole_only=True)
+    except NotSettledError:
+        return solved, options, effects
+    return with_more, assuming_more, ()
 
 
 def _undetermined_effects(solved: Solved, options: Options) -> Iterator[Effect]:
