@@ -30,9 +30,6 @@ POLL_S = 0.02
 GREETING_S = 2.0
 """Longest silence in the greeting of a board that was reset by opening its port, and
 between the answers to what was given up: Marlin says every 2 s that it is busy."""
-SAME_ZERO_MM = 0.02
-"""Difference of a position in its own frame, which Marlin tells to two decimals, from that of the
-machine, without an offset."""
 HOLD_S = 0.3
 """Shortest time from a feed hold to the reset: a reset during the motion loses the position."""
 MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
@@ -371,6 +368,8 @@ class _Marlin(_Talk):
     QUERY, HALT, STEPS = "M114 R", b"M410\n", "M92"
     GREETING = "start"
     MODES = ("G21", "G90")
+    SAME_ZERO_MM = 0.02
+    """Difference of a position in its own frame, which has two decimals, from the machine's."""
 
     def _begin(self) -> None:
         self._lines.forget()
@@ -419,7 +418,7 @@ class _Marlin(_Talk):
     ) -> None:
         """Raise if moves count from another zero than the machine."""
         for letter, value in machines.items():
-            if abs(told.get(letter, value) - value) > SAME_ZERO_MM:
+            if abs(told.get(letter, value) - value) > self.SAME_ZERO_MM:
                 raise MachineError(
                     f"it says {letter}{told[letter]:g}, the machine stands at {value:.6g} mm: an "
                     "offset is active",
@@ -445,6 +444,7 @@ class _Klipper(_Marlin):
 
     QUERY, HALT, STEPS = "GET_POSITION", b"M112\n", ""
     GREETING = ""
+    SAME_ZERO_MM = 1e-5  # of six decimals
 
     def position(self) -> list[float]:
         positions = {

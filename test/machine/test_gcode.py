@@ -229,18 +229,23 @@ def test_a_mode_that_another_sets_between_moves_changes_no_move(dialect, mode):
 
 
 @pytest.mark.parametrize(
-    ("dialect", "kind"),
-    [("marlin", Marlin), ("marlin", Duet), ("klipper", Klipper)],
+    ("dialect", "kind", "zero"),
+    [
+        ("marlin", Marlin, 100.0),
+        ("marlin", Duet, 100.0),
+        ("klipper", Klipper, 100.0),
+        ("klipper", Klipper, 0.001),
+    ],
 )
 def test_a_controller_whose_moves_count_from_another_zero_is_refused_and_not_moved(
-    dialect, kind
+    dialect, kind, zero
 ):
     """G92 X0 at 100 mm: a move to 100.05 by its steps would go to 200.05."""
     firmware = kind()
-    firmware.at["X"], firmware.zero = 100.0, 100.0
+    firmware.at["X"], firmware.zero = 100.0, zero
     with over_tcp(firmware) as port:
         machine = GcodeMachine(port, dialect, feed=6000.0)
-        said = "it says X0, the machine stands at 100 mm: an offset is active"
+        said = f"it says X{100 - zero:g}, the machine stands at 100 mm: an offset is active"
         with pytest.raises(MachineError, match=said):
             machine.move_to((0.10005, 0.0))
         firmware.zero = 0.0
