@@ -2,6 +2,7 @@
 """The length that sets the scale of a map: what was certified, and at which temperature."""
 
 import math
+import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -115,8 +116,8 @@ class ReferenceLength:
 
     @property
     def certificate_key(self) -> str:
-        """Letters and digits of the certificate: the same however it is spelled."""
-        return "".join(filter(str.isalnum, self.certificate.casefold()))
+        """Words and numbers of the certificate: the same however it is spelled."""
+        return " ".join(re.findall(r"[^\W\d_]+|\d+", self.certificate.casefold()))
 
     @property
     def each(self) -> tuple["ReferenceLength", ...]:

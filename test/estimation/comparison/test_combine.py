@@ -574,6 +574,14 @@ def test_a_run_that_disagrees_is_named_where_the_scatter_is_chance():
         assert sentence.endswith(text)
 
 
+def test_numbers_of_certificates_are_told_apart_where_they_are_divided():
+    keys = [
+        ReferenceLength("artifact", 0.0, 1e-7, text).certificate_key
+        for text in ("PTB 1-23", "ptb1/23", "PTB 12-3", "--")
+    ]
+    assert keys[0] == keys[1] != keys[2] and not keys[3]
+
+
 def test_one_certificate_is_one_length_however_it_is_spelled():
     """Its u, 2 µm/m, does not average out; runs that state it with other numbers are refused."""
     at = "20.4:0:5e-7:0"
