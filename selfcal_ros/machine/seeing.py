@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.settings.detector import DetectorSettings
-from selfcal_ros.vision.images import Picture
+from selfcal_ros.vision.images import Picture, saturated_at
 
 if TYPE_CHECKING:
     from selfcal_ros.vision.exposures import ImageDetector  # for its name
@@ -124,9 +124,8 @@ class Eye:
                 "machine.image",
                 "set the camera to one size and type; see whether it was reset",
             )
-        full = (self._settings.full_scale if self._settings else 0) or int(
-            np.iinfo(pixels.dtype).max
-        )
+        saturated = saturated_at(pixels, int(np.iinfo(pixels.dtype).max))
+        full = (self._settings.full_scale if self._settings else 0) or saturated
         last = self._before
         self._before = (pixels.copy(), position)
         self.newest = self._before[0]
@@ -153,7 +152,7 @@ class Eye:
                 "machine.image",
                 "check light, shutter, lens cap and exposure time, and full_scale of the detector",
             )
-        return Picture(pixels, int(np.iinfo(pixels.dtype).max))
+        return Picture(pixels, saturated)
 
 
 def commonest_rejections(rejected: Mapping[str, int]) -> str:

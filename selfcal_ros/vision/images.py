@@ -179,18 +179,21 @@ def _values(picture: Image.Image) -> Picture:
         raise ValueError("values beyond 16 bits")
     grey = _grey(values.astype(GREY_MODES[picture.mode])[:, :, None])
     if 8 < bits <= 16:
-        grey = grey._replace(full_scale=(1 << (bits - signed)) - 1)
+        full = (1 << (bits - signed)) - 1
+        if bits == 16:  # of the file: those of the camera may be fewer
+            full = saturated_at(grey.values, full)
+        grey = grey._replace(full_scale=full)
     return grey
 
 
 def _grey(values: np.ndarray) -> Picture:
     full = int(np.iinfo(values.dtype).max)
     if values.shape[2] == 1:
-        return Picture(values[:, :, 0], _saturated_at(values, full))
+        return Picture(values[:, :, 0], saturated_at(values, full))
     return Picture(values.sum(axis=2, dtype=np.uint16), 3 * full)
 
 
-def _saturated_at(values: np.ndarray, full: int) -> int:
+def saturated_at(values: np.ndarray, full: int) -> int:
     """Return the value of a saturated pixel of a camera of 9 to 16 bits.
 
     That is the largest of the encoding, unless the image ends at the largest value of fewer bits,

@@ -15,8 +15,10 @@ from selfcal_ros.bagio.journal import Journal
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.machine import MachineError, Offset, visiting
+from selfcal_ros.machine import Image, MachineError, Offset, visiting
 from selfcal_ros.machine.clock import Clock
+from selfcal_ros.machine.seeing import Eye
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.settings.nodes import CollectorSettings
 from test.machine.test_measuring import away_from, run_of
 from test.support.cells import PLAN, Agreeing, Jumping, write_cell
@@ -427,3 +429,17 @@ def test_a_robot_that_lays_the_plate_otherwise_is_refused_by_its_view(tmp_path):
     with pytest.raises(InputError, match="rot90"):
         run_of(tmp_path, spoilt, cell).measure()
     assert spoilt.stops
+
+
+def test_a_camera_of_12_bits_in_16_saturates_where_it_ends():
+    """As in the same image from a file: a clipped mark is rejected, a clipped image refused."""
+    sizes = {"pixel_size": 1e-6, "mark": "disc", "mark_size": 4e-5}
+    eye = Eye(DetectorSettings.checked({**sizes, "polarity": "bright"}, "test"), "test")
+    v, u = np.mgrid[:120, :130]
+    share = np.clip(20.5 - np.hypot(v - 60, u - 65), 0, 1)
+    noise = np.random.default_rng(3).normal(0, 10, share.shape)
+    values = np.clip(1000 + 4000 * share + noise, 0, 4095).astype(np.uint16)
+    assert eye.detections(Image(values), 1, (0.0, 0.0, 0.0)) == []
+    assert eye.why == " (rejected: saturated 1)"
+    with pytest.raises(MachineError, match="the image is saturated"):
+        eye.trusted(Image(np.where(v > 50, np.uint16(4095), values)), (0.0, 0.0, 0.0))

@@ -259,6 +259,12 @@ def test_16_bits_with_a_camera_of_fewer_saturate_where_they_end(largest, full):
     """The low or the high bits; what ends elsewhere is not saturated."""
     values = np.array([[100, largest, largest, 7]], np.uint16)
     assert decoded(saved(Image.fromarray(values), "PNG"), "f.png").full_scale == full
+    assert decoded(tiff(values), "f.tif").full_scale == full
+
+
+def test_signed_16_bits_with_a_camera_of_12_saturate_where_they_end():
+    values = np.array([[100, 4095, 4095, 7]], np.uint16)
+    assert decoded(tiff(values, (339, 2)), "f.tif").full_scale == 4095
 
 
 def test_a_tiff_of_one_bit_without_a_tag_for_it():
