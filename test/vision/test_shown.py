@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.vision.shown import spots_in
+from selfcal_ros.vision.shown import alternates, spots_in
 
 
 def spots(side, *, dark, pitch=60, shape=(300, 360)):
@@ -51,3 +51,38 @@ def test_noise_shows_nothing(noise, light):
     if light == "photons":
         values = rng.poisson(noise / 10, (300, 360))
     assert spots_in(np.clip(values, 0, 255).astype(np.uint8)) is None
+
+
+@pytest.mark.parametrize("noise", [0.0, 4.0])
+@pytest.mark.parametrize(
+    ("side", "pitch"), [(3, 6), (5, 6), (3, 8), (5, 8), (5, 20), (3, 40), (5, 40)]
+)
+def test_sharp_marks_at_an_even_pitch_are_not_a_bayer_pattern(side, pitch, noise):
+    v, u = np.mgrid[:240, :280]
+    inside = (u % pitch < side) & (v % pitch < side)
+    values = np.where(inside, 60.0, 180.0)
+    values += np.random.default_rng(2).normal(0, noise, values.shape)
+    assert not alternates(np.rint(values).astype(np.uint8))
+
+
+FILTERS = {
+    "green of a Bayer pattern": [[0.5, 1.0], [1.0, 0.6]],
+    "red light": [[1.0, 0.3], [0.3, 0.1]],
+    "every other row": [[1.0, 1.0], [0.7, 0.7]],
+    "every other column": [[1.0, 0.7], [1.0, 0.7]],
+}
+
+
+@pytest.mark.parametrize("filters", FILTERS.values(), ids=FILTERS)
+@pytest.mark.parametrize("dark", [True, False])
+def test_a_pattern_beside_the_marks_as_well_is_one_of_a_colour_camera(filters, dark):
+    values = spots(21, dark=dark)
+    assert not alternates(values)
+    raw = np.rint(values * np.tile(filters, (150, 180))).astype(np.uint8)
+    assert alternates(raw)
+    assert alternates(raw[1:, 1:])  # an odd number of rows and columns
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1)])
+def test_one_row_or_column_is_not_a_bayer_pattern(shape):
+    assert not alternates(np.arange(40, dtype=np.uint8).reshape(shape))
