@@ -156,11 +156,11 @@ def _on_lattice(
     """Return whether most marks, at these pixels, have ids, which lie as on the plate.
 
     Otherwise a marker is read wrongly: one that is cut by the border of the image may have another
-    size, which shows at marks that are far from it.
+    size, which shows at marks that are far from it. One mark without an id may be a speck.
     """
     has_id = np.array([isinstance(mark_id, tuple) for mark_id in ids], dtype=bool)
     others = sum(mark_id is None for mark_id in ids)
-    if others >= max(has_id.sum(), 1):
+    if others > 1 and others >= has_id.sum():
         return False
     if not has_id.any():
         return True

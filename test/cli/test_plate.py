@@ -3,6 +3,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from shutil import copyfile
 
 import numpy as np
@@ -18,6 +19,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.edge_markers import edge_markers
 from selfcal_ros.model.marks import MarkList
 from selfcal_ros.settings.detector import MARKS, DetectorSettings
+from selfcal_ros.vision.coded import CodedPlate
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
@@ -231,6 +233,25 @@ def test_a_marker_that_the_marks_contradict_is_not_believed(coded_svg):
     detector._coded._reader = Shrunk(detector._coded._reader)
     assert not any(each.has_id for each in detector.take_picture(picture, 2))
     assert detector.counts.contradicting == 1
+
+
+def test_a_mark_keeps_its_id_beside_one_speck(coded_svg):
+    picture, _ = photographed(
+        coded_svg, np.random.default_rng(1), turn=0.3, centre=(2.0, 0), mirror=False
+    )
+    sizes = {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4}
+    marks, _ = MarkDetector(DetectorSettings.checked(sizes, "test")).marks(picture)
+    plate = CodedPlate("6x5", "test")
+    name = plate.identified(marks, picture, mirror=False)[0]
+    assert name is not None
+    speck = replace(marks[0], u=marks[0].u + PITCH_PX / 2)
+    both = plate.identified([marks[0], speck], picture, mirror=False)
+    assert both == [name, None] and plate.contradicting == 0
+    assert plate.identified([speck], picture, mirror=False) == [None]
+    assert plate.contradicting == 0
+    # two marks lie on a lattice of any size: as many without ids contradict them
+    four = plate.identified([*marks[:2], speck, speck], picture, mirror=False)
+    assert four == [None] * 4 and plate.contradicting == 1
 
 
 @pytest.mark.parametrize("factor", [16, 0.15])
