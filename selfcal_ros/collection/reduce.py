@@ -331,13 +331,15 @@ def _identified(
     if view.image is None or not np.isin(assignment.reasons, DISPLACED).any():
         return assignment, number
     offset = np.stack([d["offset_x"], d["offset_y"]])
-    places_m = (
-        _reading(rules.sense, position, offset),
-        _reading(rules.sense, position, 0.0),
+    images = UnnamedImages(
+        artifact,
+        view,
+        d,
+        assignment.rigid,
+        reading_m=_reading(rules.sense, position, offset),
+        stage_m=_reading(rules.sense, position, 0.0),
     )
-    if not d["has_id"].any() and images_late(
-        artifact, view, d, assignment.rigid, places_m
-    ):
+    if not d["has_id"].any() and images.exposures_late():
         assignment.reasons[:] = Reason.NOT_AT_MARK
         return assignment, number
     named = d["has_id"] & (assignment.reasons != Reason.UNKNOWN_MARK)
@@ -443,9 +445,7 @@ class UnnamedImages:
         """
         if not len(self.detections):
             return None
-        middles, beside = _middles_seen(
-            self.artifact, self.view, self.rigid, self.reading_m, self.stage_m
-        )
+        middles, beside = self._middles_seen()
         if 4 * max(self.artifact.shape) * beside > len(self.detections):
             return None
         whole = _on_stage(self.artifact, self.view, middles)
@@ -454,91 +454,75 @@ class UnnamedImages:
 
     def late(self) -> tuple[int, float]:
         """Return by how many exposures, and s, they are late; 0 if they are not."""
-        places_m = self.reading_m, self.stage_m
-        late = images_late(
-            self.artifact, self.view, self.detections, self.rigid, places_m
-        )
+        late = self.exposures_late()
         if not late:
             return 0, 0.0
         stamps = np.unique(self.detections["stamp"])
         by = abs(late)
         return late, float(np.median(stamps[by:] - stamps[: len(stamps) - by])) * 1e-9
 
+    def exposures_late(self) -> int:
+        """Return by how many exposures they are late; 0 if they are not.
 
-def _middles_seen(
-    artifact: Artifact,
-    view: View,
-    rigid: Rigid,
-    reading_m: np.ndarray,
-    stage_m: np.ndarray,
-) -> tuple[list[int], int]:
-    """Return where, m and n, the images lack the fewest marks, and how many are beside it."""
-    steps = [cell.step_on_plate(artifact) for cell in view.sub_views]
-    middles, most = [], 0
-    for row, side, stage_row, step in zip(
-        _rows_at(artifact, view, rigid, reading_m),
-        artifact.shape,
-        _rows_at(artifact, view, rigid, stage_m),
-        zip(*steps, strict=True),
-        strict=True,
-    ):
-        visible = int(stage_row.min()) + min(step), int(stage_row.max()) + max(step)
-        middle = stops.middle_of(row, side, visible=visible)
-        first = middle - side // 2
-        most = max(most, int(((row < first) | (row >= first + side)).sum()))
-        middles.append(middle)
-    return middles, most
+        Which cells show a mark tells at which stops near the edge of the plate an image was taken.
+        """
+        d, view = self.detections, self.view
+        offset = np.stack([d["offset_x"], d["offset_y"]])
+        number = stops.numbers_of(view, stops.cells_of(view, offset))
+        _, first, image = np.unique(d["stamp"], return_index=True, return_inverse=True)
+        if len(first) < LEAST_IMAGES:
+            return 0
+        seen = np.zeros((len(first), len(view.sub_views)), dtype=bool)
+        seen[image[number >= 0], number[number >= 0]] = True
+        at = self._rows(self.stage_m[:, first])
 
+        def fitting(middles: Sequence[int], late: int = 0) -> float:
+            expected = np.ones_like(seen)
+            for row, side, middle, step in zip(
+                at, self.artifact.shape, middles, self._steps, strict=True
+            ):
+                from_first = row[:, None] + np.array(step) - (middle - side // 2)
+                expected &= (from_first >= 0) & (from_first < side)
+            ends = slice(max(late, 0), len(seen) + min(late, 0))
+            as_expected = seen == np.roll(expected, late, axis=0)
+            return float(as_expected.all(axis=1)[ends].mean())
 
-def images_late(
-    artifact: Artifact,
-    view: View,
-    d: np.ndarray,
-    rigid: Rigid,
-    readings_m: tuple[np.ndarray, np.ndarray],
-) -> int:
-    """Return by how many exposures images without ids are late, 0 if they are not.
+        planned = fitting((0, 0))
+        if planned > ALL_FIT:
+            return 0
+        displaced = fitting(self._middles_seen()[0])
+        by_late = {late: fitting((0, 0), late) for late in LATE_IMAGES}
+        best = max(by_late, key=lambda late: by_late[late])
+        return best if by_late[best] > max(displaced, planned) + CLEARLY else 0
 
-    Which cells show a mark tells at which stops near the edge of the plate an image was taken.
+    @property
+    def _steps(self) -> tuple[tuple[int, ...], ...]:
+        """Steps along m and n from the mark at the stage to that of each cell."""
+        steps = (cell.step_on_plate(self.artifact) for cell in self.view.sub_views)
+        return tuple(zip(*steps, strict=True))
 
-    Parameters
-    ----------
-    artifact, view
-        The plate and its pose.
-    d : structured array (n,)
-        Detections.
-    rigid : Rigid
-        The plate's own motion.
-    readings_m : tuple of float array (2, n)
-        Places of the marks, and of the stage.
-    """
-    offset = np.stack([d["offset_x"], d["offset_y"]])
-    number = stops.numbers_of(view, stops.cells_of(view, offset))
-    _, first, image = np.unique(d["stamp"], return_index=True, return_inverse=True)
-    if len(first) < LEAST_IMAGES:
-        return 0
-    seen = np.zeros((len(first), len(view.sub_views)), dtype=bool)
-    seen[image[number >= 0], number[number >= 0]] = True
-    at = _rows_at(artifact, view, rigid, readings_m[1][:, first])
-    steps = [cell.step_on_plate(artifact) for cell in view.sub_views]
+    def _rows(self, places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _rows_at(self.artifact, self.view, self.rigid, places_m)
 
-    def fitting(middles: Sequence[int], late: int = 0) -> float:
-        expected = np.ones_like(seen)
-        for row, side, middle, step in zip(
-            at, artifact.shape, middles, zip(*steps, strict=True), strict=True
+    def _middles_seen(self) -> tuple[list[int], int]:
+        """Return where, m and n, they lack the fewest marks, and how many are beside it."""
+        middles, most = [], 0
+        for row, side, stage_row, step in zip(
+            self._rows(self.reading_m),
+            self.artifact.shape,
+            self._rows(self.stage_m),
+            self._steps,
+            strict=True,
         ):
-            from_first = row[:, None] + np.array(step) - (middle - side // 2)
-            expected &= (from_first >= 0) & (from_first < side)
-        ends = slice(max(late, 0), len(seen) + min(late, 0))
-        return float((seen == np.roll(expected, late, axis=0)).all(axis=1)[ends].mean())
-
-    planned = fitting((0, 0))
-    if planned > ALL_FIT:
-        return 0
-    displaced = fitting(_middles_seen(artifact, view, rigid, *readings_m)[0])
-    by_late = {late: fitting((0, 0), late) for late in LATE_IMAGES}
-    best = max(by_late, key=lambda late: by_late[late])
-    return best if by_late[best] > max(displaced, planned) + CLEARLY else 0
+            visible = (
+                int(stage_row.min()) + min(step),
+                int(stage_row.max()) + max(step),
+            )
+            middle = stops.middle_of(row, side, visible=visible)
+            first = middle - side // 2
+            most = max(most, int(((row < first) | (row >= first + side)).sum()))
+            middles.append(middle)
+        return middles, most
 
 
 LEAST_IMAGES = 20
