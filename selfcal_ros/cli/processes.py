@@ -23,7 +23,8 @@ from typing import Any, Self
 
 from selfcal_ros import portable
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_bytes
+from selfcal_ros.files import read_yaml
+from selfcal_ros.settings.nodes import check_parameters
 from selfcal_ros.start import missing_ros
 
 PR_SET_PDEATHSIG = 1
@@ -53,13 +54,13 @@ def ros_arguments(args: argparse.Namespace) -> list[str]:
     Raises
     ------
     InputError
-        If the parameter file cannot be read.
+        If the parameter file cannot be read, or no node takes what it sets.
     """
     words = ["--ros-args"]
     if args.namespace.strip("/"):
         words += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
     if args.params:
-        read_bytes(args.params)
+        check_parameters(read_yaml(args.params), args.params)
         words += ["--params-file", str(Path(args.params).absolute())]
     return words
 

@@ -38,12 +38,12 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import read_json, write_yaml
+from selfcal_ros.files import read_json, read_yaml, write_yaml
 from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
-from selfcal_ros.settings.nodes import CollectorSettings
+from selfcal_ros.settings.nodes import CollectorSettings, check_parameters
 from selfcal_ros.settings.parameter import TYPED
 from selfcal_ros.topics import INPUT_TOPICS, LARGEST_DOMAIN
 
@@ -90,6 +90,8 @@ def run(args: argparse.Namespace) -> int:
     """Start the nodes, play the bag, collect the result, stop the nodes."""
     need_ros(", or use `selfcal solve`")
     _check(args)
+    if args.params:
+        check_parameters(read_yaml(args.params), args.params)
     source = bag_input(args.bag)
     detector = detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
@@ -111,17 +113,24 @@ def run(args: argparse.Namespace) -> int:
                 write_json(args.output, data)
             if on_stdout(args):
                 put(data)
+            _warn_of_rejections(args, data, by_detector=detector is not None)
         _refuse_fault(args, code, detector, folder, printed_faults=bag.faults)
         if code or not saved.exists():  # perhaps a result without a map
             return code or 1
     result = result_from_dict(data, args.bag)
-    lines = rejections(result.rejected, sum(view.used for view in result.views))
-    if lines and (detector is not None or not offline(args, args.bag).findings):
-        for line in lines:
-            warn(args, f"{args.bag}: {line}")
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
+
+
+def _warn_of_rejections(
+    args: argparse.Namespace, data: dict[str, Any], *, by_detector: bool
+) -> None:
+    """Print what `solve` says of many rejections, whether or not there is a map."""
+    lines = rejections(data["rejected"], sum(view["used"] for view in data["views"]))
+    if lines and (by_detector or not offline(args, args.bag).findings):
+        for line in lines:
+            warn(args, f"{args.bag}: {line}")
 
 
 def _check(args: argparse.Namespace) -> None:

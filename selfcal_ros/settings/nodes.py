@@ -717,6 +717,22 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
     return overrides
 
 
+def check_parameters(data: object, where: str) -> None:
+    """Refuse a parsed ROS parameter file with a node, a name or a value that no node takes.
+
+    Each section is checked by itself: those of several cells may differ.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    for name, section in _sections(data, "", where):
+        alone = {name: {"ros__parameters": section}}
+        for node, kind in NODE_SETTINGS.items():
+            kind.checked(overrides_in(alone, node, where), where)
+
+
 def _sections(data: object, prefix: str, where: str) -> list[tuple[str, dict]]:
     if not isinstance(data, dict):
         raise InputError(

@@ -29,11 +29,18 @@ from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
+from selfcal_ros.settings.nodes import check_parameters
 from test.support.bags import Foreign
 from test.support.mark_lists import listed_plan
 from test.support.plans import image_plan, placed_plan
 from test.support.ports import settings_of
-from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
+from test.support.sessions import (
+    events_of,
+    plan_file,
+    small_bag,
+    small_plan,
+    stepped_bag,
+)
 from test.support.verbs import simulate
 
 
@@ -336,26 +343,63 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(
     assert capsys.readouterr().err == "what the nodes say\n"
 
 
-def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, capsys):
-    bag = small_bag(tmp_path, small_plan(repeats=4), not_finite=0.2)
+@pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90", 3)])
+def test_many_rejections_are_said_as_solve_says_them(
+    monkeypatch, tmp_path, capsys, plan, code
+):
+    bag = small_bag(tmp_path, small_plan(plan, repeats=4), not_finite=0.2)
     assert (
         selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")])
-        == 0
+        == code
     )
-    said = capsys.readouterr().err
+    said = capsys.readouterr().err.splitlines(keepends=True)[0]
     assert "detections were rejected" in said and "not_finite" in said
 
     @contextmanager
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
             write_json(given[2], read_json(tmp_path / "solved.json"))
-        yield SimpleNamespace(stdout=[], wait=lambda: 0)
+        yield SimpleNamespace(stdout=[], wait=lambda: code)
 
     monkeypatch.setattr(replay_verb, "process", process)
-    assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 0
+    assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == code
     assert capsys.readouterr().err == said.replace(
         "selfcal solve: ", "selfcal replay: "
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (
+            "solver: {ros__parameters: {datum_theta: xy_axes}}",
+            "datum_theta: solver has no such parameter; did you mean 'theta_datum'",
+        ),
+        (
+            "solvr: {ros__parameters: {robust: true}}",
+            "/solvr: no node of this package; did you mean 'solver'",
+        ),
+        (
+            "/**: {ros__parameters: {robust: maybe}}",
+            "robust: 'maybe' is not of type bool",
+        ),
+    ],
+)
+@pytest.mark.parametrize("verb", [["replay", "bag"], ["up", "--plan", "PLAN"]])
+def test_a_parameter_that_no_node_takes_is_refused_before_any_is_started(
+    tmp_path, capsys, text, problem, verb
+):
+    plan, params = plan_file(tmp_path, small_plan()), tmp_path / "p.yaml"
+    params.write_text(text)
+    words = [plan if word == "PLAN" else word for word in verb]
+    assert selfcal([*words, "--params", str(params)]) == 2
+    assert f"selfcal {verb[0]}: {params}: {problem}" in capsys.readouterr().err
+
+
+def test_sections_of_two_cells_may_differ():
+    section = {"ros__parameters": {"robust": True}}
+    other = {"ros__parameters": {"robust": False, "use_sim_time": True}}
+    check_parameters({"/a/solver": section, "/b/solver": other}, "p.yaml")
 
 
 @pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90, tx", 2)])

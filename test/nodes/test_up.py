@@ -275,7 +275,7 @@ def test_states_without_a_home_are_asked_for(monkeypatch):
 
 def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "cell.yaml").touch()
+    (tmp_path / "cell.yaml").write_text("solver: {ros__parameters: {}}")
     args = build_parser().parse_args(
         ["up", "--plan", "p.yaml", "--params", "cell.yaml"]
     )
@@ -402,7 +402,7 @@ def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line
 
 def test_marks_are_detected_on_request(tmp_path):
     params = tmp_path / "n.yaml"
-    params.touch()
+    params.write_text("mark_detector: {ros__parameters: {}}")
     for more, there in (([], False), (["--detect"], True)):
         args = build_parser("up").parse_args(
             [
