@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.kept import Covariance, Kept
 from selfcal_ros.simulation.machine import random_truth
 from test.support.truth import simulate_measurements
 from tools.reality.__main__ import BEGIN, COLUMNS, END, record, row, table, write_table
@@ -34,6 +36,7 @@ from tools.reality.runs import (
     measured,
     rows,
     run_case,
+    share_by_chance,
     summarise,
 )
 
@@ -87,6 +90,24 @@ def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
     )
     assert wrong.error_m == pytest.approx(2e-7, rel=0.05)
     assert wrong.within == pytest.approx(1 - 1 / 242, abs=1e-9)
+
+
+def test_fewer_errors_may_lie_inside_by_chance_where_all_have_one_cause():
+    plan, rng = hu(1), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
+    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9))
+
+    def by_chance(correlation):
+        kept = Kept(covariances={"xy": Covariance.of(4e-16 * correlation)})
+        return share_by_chance(replace(result, kept=kept))
+
+    n = 2 * 11**2
+    alone = binom.ppf(0.01, n, 0.9545) / n
+    assert by_chance(np.eye(n)) == pytest.approx(alone, abs=0.006)
+    # of one error that all share, all or none lie inside
+    assert by_chance(np.ones((n, n))) == 0.0
+    halves = np.kron(np.eye(2), np.ones((n // 2, n // 2)))
+    assert by_chance(halves) == 0.5
 
 
 def test_cases_have_the_stop_errors_that_their_names_say():

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.readings import Measurements
@@ -27,7 +28,11 @@ from tools.reality.populations import populations
 
 WRONG = (0.85, 242)
 """Part of the map inside k u below which a single map is called wrong: of 242 correlated
-coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run."""
+coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run. Where one
+smooth error dominates, as few are inside by chance: see `share_by_chance`."""
+OF_DRAWS = 0.01, 2000
+"""Part of the draws from the covariance of a map that may have fewer errors inside than a map that
+is not wrong, and how many are drawn."""
 BY_CHANCE = 1e-4
 """Probability of as few angles inside k u as make a map of angles wrong: 17 of 24, 3 of 8."""
 COVERAGE = 0.9545
@@ -189,7 +194,10 @@ def compared(
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
     n_theta = int(np.isfinite(theta).sum())
     holds = not (
-        within < limit(int(np.isfinite(error).sum()))
+        (
+            within < limit(int(np.isfinite(error).sum()))
+            and within < share_by_chance(result)
+        )
         or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1)
     )
     return Run(
@@ -210,6 +218,25 @@ def limit(n_errors: int) -> float:
     """Return the part inside k u below which an XY map is wrong; fewer errors scatter more."""
     at, count = WRONG
     return COVERAGE - (COVERAGE - at) * float(np.sqrt(count / max(n_errors, 1)))
+
+
+def share_by_chance(result: CalibrationResult) -> float:
+    """Return the part inside 2 u that only `OF_DRAWS` of maps have less of whose u is right.
+
+    Their errors are drawn from the correlations of the result's own map.
+    """
+    known_sites = np.isfinite(result.error_map.gx)
+    covariance = covariance_of(result, "xy", known_sites)
+    if covariance.ndim == 1:
+        covariance = np.diag(covariance)
+    u = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.maximum(np.outer(u, u), ROUNDING**2)
+    variances, modes = np.linalg.eigh(correlation)
+    part, count = OF_DRAWS
+    normal = np.random.default_rng(0).normal(size=(count, len(variances)))
+    errors_in_u = normal * np.sqrt(np.maximum(variances, 0.0)) @ modes.T
+    k = float(norm.ppf((1 + COVERAGE) / 2))
+    return float(np.quantile(np.mean(np.abs(errors_in_u) <= k, axis=1), part))
 
 
 ROUNDING = 1e-13
