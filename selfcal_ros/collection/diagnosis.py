@@ -267,12 +267,22 @@ def _stage(e: Evidence, reason: str) -> str | None:
 
 
 def _encoder_stopped(e: Evidence) -> str | None:
-    """Return that the encoder stands still since some mark; not if it never moved."""
+    """Return that the encoder stands still since some mark, and was at the marks before.
+
+    One whose stamps are late is at none of them, and at rest where the view has ended.
+    """
     for view in e.marks:
-        stage, sites = view.stage[-STOPPED:], view.sites[-STOPPED:]
-        still = len(stage) == STOPPED and np.abs(stage - stage[-1]).max() < 1 / 4
-        had_moved = np.abs(view.stage - stage[-1]).max() > 1 / 2
-        if still and had_moved and np.abs(sites - sites[-1]).max() > 1:
+        stage, sites = view.stage, view.sites
+        from_last = np.abs(stage - stage[-1:])
+        elsewhere = np.flatnonzero(from_last > 1 / 4)
+        if not len(elsewhere) or from_last.max() <= 1 / 2:
+            continue
+        moved = slice(elsewhere[-1] + 1)
+        last = slice(-STOPPED, None)
+        still = len(stage) - moved.stop >= STOPPED
+        off_sites_m = np.abs(stage + view.cells - sites)[moved] * e.pitch_m
+        was_at_marks = np.median(off_sites_m) <= e.limit_m
+        if still and was_at_marks and np.abs(sites - sites[-1])[last].max() > 1:
             return (
                 f"the stage has stopped: it is indicated at {_place(e, stage[-1] * e.pitch_m)} "
                 f"at each of the last {STOPPED} marks; check the encoder and what publishes "

@@ -80,11 +80,15 @@ def lag_of(
     for width, looked_at in ((0, off), (FINE, off & np.isfinite(sites))):
         if looked_at.sum() < AT_LEAST:
             return None
-        here, fit = known[:, looked_at], fits[:, looked_at]
-        part = _explained(here, _widened(fit, width) & here)
+        here = known[:, looked_at]
+        fit = _widened(fits[:, looked_at], width) & here
+        part = _explained(here, fit)
         good = np.flatnonzero(part >= NEARLY_ALL)
         if len(good):
-            nearest = good[np.abs(good - middle).argmin()]
+            # off by a pass, those of one pass do not fit: the stage was not there yet
+            number = fit.sum(axis=1)[good]
+            most_fit = good[number == number.max()]
+            nearest = most_fit[np.abs(most_fit - middle).argmin()]
             run = _run(part >= NEARLY_ALL, nearest)
             return Lag(
                 float(lags[run].mean() * S_PER_NS),

@@ -432,6 +432,17 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     )
 
 
+@pytest.mark.parametrize("ahead_s", [-0.3, 0.3])
+def test_an_encoder_of_another_clock_is_not_taken_for_a_stage_that_has_stopped(ahead_s):
+    """The stage waits where the lines are, while the last marks of the view are detected."""
+    cell = scene(size=7, count=40, repeats=3)
+    shift_ns = round(ahead_s * 1e9)
+    cell.samples = [replace(s, stamp_ns=s.stamp_ns + shift_ns) for s in cell.samples]
+    found = findings(cell.events)[None]
+    side = "before" if ahead_s < 0 else "after"
+    assert f"the stage rests at the marks about {abs(ahead_s)} s {side} their" in found
+
+
 def test_a_clock_that_stepped_back_is_not_taken_for_a_stage_elsewhere():
     """Positions between samples of two times are none."""
     cell = scene(count=0, repeats=4)
@@ -737,10 +748,12 @@ def declared(cell, *size):
 
 def test_a_mark_that_is_read_many_times_is_not_a_stage_that_has_stopped():
     places = np.array([0j] * 5 + [3 + 1j] * 20)
-    marks = SimpleNamespace(stage=places, sites=places)
-    seen = SimpleNamespace(marks=[marks], pitch_m=0.01, sense=Sense.MICROSCOPE_MOVES)
+    marks = SimpleNamespace(stage=places, sites=places, cells=np.zeros(25))
+    seen = SimpleNamespace(
+        marks=[marks], pitch_m=0.01, limit_m=1e-3, sense=Sense.MICROSCOPE_MOVES
+    )
     assert _encoder_stopped(seen) is None
-    marks.sites = places + np.linspace(0, 2, 25)
+    marks.sites = places + np.where(np.arange(25) < 5, 0.0, np.linspace(0, 2, 25))
     assert (
         "the stage has stopped: it is indicated at x = 0.03 m, y = 0.01 m"
         in _encoder_stopped(seen)

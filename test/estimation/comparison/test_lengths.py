@@ -89,6 +89,27 @@ def test_what_lengths_may_differ_by_is_not_scatter_between_runs():
     ).result.verdict.enlarged_by
 
 
+def test_certificates_average_out_by_the_weights_of_their_runs():
+    runs = [
+        run("a", 0, length("A", 0, 1.0e-6), 1),
+        run("b", 1e-6, length("B", 1e-6, 1.2e-6), 2),
+        run("c", 1e-6, length("B", 1e-6, 1.2e-6), 3),
+    ]
+    mean = combine(runs, keep_scale=True).xy
+    a, b, c = mean.weights
+    of_certificates = (a * 1.0e-6) ** 2 + ((b + c) * 1.2e-6) ** 2
+    of_noise = (mean.weights**2).sum() * NOISE_M**2
+    expected = of_noise + of_certificates * PLACE.ravel() ** 2
+    np.testing.assert_allclose(mean.within, expected, rtol=0.06)  # of the datum
+
+
+def test_a_run_without_a_length_is_not_of_the_certificate_of_the_others():
+    pair = [length("A", 1e-6, 2e-7), length("A", 1e-6, 2e-7)]
+    lengths = lengths_of([None, *pair], np.ones(2))
+    assert lengths.certificates.shape == (3, 0)
+    np.testing.assert_allclose(lengths.one, [0, 2e-7, 2e-7])
+
+
 def test_the_variance_between_correlated_runs_is_that_of_what_they_do_not_share():
     """An error common to all runs changes nothing; one of two runs is that of their mean."""
     values = np.array([[-3.0], [1.0], [2.0]])
