@@ -96,6 +96,25 @@ def lengths_of(
     return Lengths(place, of_group * u[:, None], np.zeros(len(u)), thermal)
 
 
+def length_in_both(first: ReferenceLength, second: ReferenceLength) -> float:
+    """Return u of the length of a plate by the one certificate that both name, m/m; 0 if none.
+
+    A difference of two maps does not contain it. What their temperatures may be off by stays.
+    """
+    if not (
+        first.kind.of_plate
+        and first.certificate_key
+        and (first.kind, first.marks, first.certificate_key)
+        == (second.kind, second.marks, second.certificate_key)
+    ):
+        return 0.0
+    require_one_text(("the first map", "the second map"), (first, second))
+    stated, stated_again = (length.certified or length for length in (first, second))
+    if stated.relative_error != stated_again.relative_error:
+        return 0.0
+    return min(stated.u_relative, stated_again.u_relative)
+
+
 def require_one_text(
     names: Sequence[str], references: Sequence[ReferenceLength | None]
 ) -> None:

@@ -14,6 +14,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
     plate_as_map,
 )
+from selfcal_ros.estimation.comparison.lengths import length_in_both
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import GAP
@@ -404,15 +405,17 @@ def _difference(
     if known_places.sum() < 2:
         return _Difference(out, datum, None)
 
-    total = np.sum(
-        of_one_kind(
-            [
-                covariance_of(result, kind, known_places, plate=plates)
-                for result in results
-            ]
-        ),
-        axis=0,
-    )
+    covariances = [
+        covariance_of(result, kind, known_places, plate=plates) for result in results
+    ]
+    if kind == "xy" and not scale and not plates:
+        length = _length_in_both(results, known_places)
+        covariances = [
+            covariance
+            - (np.outer(length, length) if covariance.ndim == 2 else length**2)
+            for covariance in covariances
+        ]
+    total = np.sum(of_one_kind(covariances), axis=0)
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
     dof = joint_dof(
         *zip(
@@ -422,6 +425,20 @@ def _difference(
         )
     )
     return _Difference(out, datum, ReducedNoise(total, columns, dof))
+
+
+def _length_in_both(
+    results: Sequence[CalibrationResult], known_sites: np.ndarray
+) -> np.ndarray:
+    """Return what u of a length that sets the scale of both maps adds to Gx, then Gy, (2n,), m."""
+    lattice = results[0].artifact
+    place = np.concatenate([lattice.x_m[known_sites], lattice.y_m[known_sites]])
+    references = [
+        result.reference
+        for result in results
+        if result.reference and not result.recheck
+    ]
+    return (length_in_both(*references) if len(references) == 2 else 0.0) * place
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:

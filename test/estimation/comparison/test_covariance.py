@@ -174,16 +174,20 @@ def test_without_weights_only_the_variances_are_known():
     assert np.isnan(first_order_u(bare_views)).all()
 
 
-@pytest.mark.parametrize("keep_scale", [False, True])
-def test_maps_with_references_agree_as_often_as_they_should(keep_scale):
+@pytest.mark.parametrize(
+    ("keep_scale", "certificate"), [(False, ""), (True, ""), (True, "PTB 1")]
+)
+def test_maps_with_references_agree_as_often_as_they_should(keep_scale, certificate):
     """Ratios of 12 pairs: each holds a chi^2 of 94 (95) degrees of freedom, so that their mean
-    scatters by 0.04."""
+    scatters by 0.04. Two maps by one certificate have one error of the length."""
     found, options = [], bare(causes=False)
+    kind = "artifact" if certificate else "stage_x"
     for seed in range(12):
         pair = []
         for one in range(2):
-            error = 3e-6 * np.random.default_rng((seed, one)).normal()
-            reference = ReferenceLength("stage_x", error, 3e-6)
+            drawn = (seed,) if certificate else (seed, one)
+            error = 3e-6 * np.random.default_rng(drawn).normal()
+            reference = ReferenceLength(kind, error, 3e-6, certificate)
             pair.append(
                 calibrate(
                     measured(HU, 1000 * seed + one),

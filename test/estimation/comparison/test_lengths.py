@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.combine import Member, combine, variance_between
-from selfcal_ros.estimation.comparison.lengths import lengths_of
+from selfcal_ros.estimation.comparison.lengths import length_in_both, lengths_of
+from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.verdict import Grade
@@ -109,6 +111,23 @@ def test_a_run_without_a_length_is_not_of_the_certificate_of_the_others():
     lengths = lengths_of([None, *pair], np.ones(2))
     assert lengths.certificates.shape == (3, 0)
     np.testing.assert_allclose(lengths.one, [0, 2e-7, 2e-7])
+
+
+def test_a_difference_does_not_contain_the_length_that_both_maps_have():
+    """2 µm/m between two maps, by one certificate of 2 µm/m or by two; with correlations or not."""
+    by_one, by_another = (length(name, 1e-6, 2e-6) for name in ("A 1", "B"))
+    before, after = run("a", 0, by_one, 1), run("b", 2e-6, by_one, 2)
+    for certificate, significant in (("a1", True), ("B", False), ("", False)):
+        reference = replace(by_one, certificate=certificate)
+        result = replace(after.result, reference=reference)
+        test = compare(before.result, result, keep_scale=True).xy
+        assert test.significant is significant
+    assert length_in_both(by_one, replace(by_one, kind="stage_x")) == 0
+    assert length_in_both(by_one, by_another) == 0
+    with pytest.raises(
+        InputError, match="u_relative of the certificate 'A 1' is 3e-06"
+    ):
+        length_in_both(by_one, length("A 1", 1e-6, 3e-6))
 
 
 def test_the_variance_between_correlated_runs_is_that_of_what_they_do_not_share():
