@@ -166,6 +166,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
             _likelihood(views, *sizes[:2], _alike(views, nodes * part))[0] - planned
             for part in ROUGHER
         ),
+        # readings noisier than their repeats, as of encoders within their period
+        _likelihood(views, sizes[0] * square**0.5, *sizes[1:])[0] - planned,
     )
     best = max(tried[0][0] if tried else 0.0, otherwise)
     enough = max(CONTRADICTED, LEFT * square)

@@ -321,6 +321,28 @@ def test_a_stage_too_rough_for_its_nodes_is_no_mirrored_frame(pitches):
         assert misplaced(replace(found, views=tuple(views))) is None
 
 
+def test_readings_noisier_than_their_repeats_are_no_mirrored_frame():
+    """As of encoders within their signal period: repeats do not show it, no two views share it."""
+    poses = (
+        (0, (0, 0)),
+        (90, (0.2, 0.4)),
+        (35, (-0.8, 0.6)),
+        (180, (1.0, -0.4)),
+        (-70, (0.6, 1.0)),
+    )
+    for seed in range(3):
+        found, _ = placed.readings(
+            lattice(8, holes=(9, 30, 40), nodes=3),
+            poses,
+            np.random.default_rng(seed),
+            sigma=45e-9,
+            size=3e-7,
+            stage=np.zeros_like,
+        )
+        views = [replace(view, sigma_xy=12e-9, dof_xy=50) for view in found.views]
+        assert misplaced(replace(found, views=tuple(views))) is None
+
+
 def reflected(events, of):
     """Return the messages of a cell whose joints and offsets are of(x, y)."""
     out = []
