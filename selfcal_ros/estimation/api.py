@@ -37,7 +37,9 @@ from selfcal_ros.estimation.recheck.plate import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.findings import (
+    Finding,
     LinesSignNotShown,
+    NoiseContradicted,
     ScaleOfOffsets,
     SignNotShown,
     SignShownByLines,
@@ -171,9 +173,10 @@ def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
     of_repeats = {SignNotShown, ScaleOfOffsets, LinesSignNotShown}
-    failed = {type(finding) for finding in verdict.failed} - {SignShownByLines}
-    if verdict.failed and not failed:
+    failed = _contradictions(result)
+    if failed == {SignShownByLines}:
         return _fits(result)
+    failed -= {SignShownByLines}
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
@@ -185,12 +188,22 @@ def _fits(result: CalibrationResult) -> bool:
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    failed = {type(finding) for finding in result.verdict.failed}
-    return failed <= {SignShownByLines} and not any(
+    return _contradictions(result) <= {SignShownByLines} and not any(
         traits_of(cause.name).between
         or abs(cause.size) > traits_of(cause.name).plausible
         for cause in result.verdict.causes
     )
+
+
+def _contradictions(result: CalibrationResult) -> set[type[Finding]]:
+    """Return the tests that failed; residuals below the stated noise contradict no wiring."""
+    return {
+        type(finding)
+        for finding in result.verdict.failed
+        if not (
+            isinstance(finding, NoiseContradicted) and finding.size < finding.stated
+        )
+    }
 
 
 def _check_turned(

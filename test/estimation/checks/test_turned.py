@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Detection
-from selfcal_ros.estimation.api import _fits, calibrate
+from selfcal_ros.estimation.api import _agree, _fits, calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.model.findings import Cause
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import gathered
+from test.support.plans import plan_of
 from test.support.sessions import START_NS, small_plan
 from test.support.truth import random_truth
 
@@ -76,6 +77,30 @@ def test_right_offsets_are_not_refused(seed):
     verdict = calibrate(measured(seed=seed)).verdict
     assert [found.name for found in verdict.failed] == ["sign_shown_by_lines"]
     assert not verdict.causes
+
+
+def test_noise_declared_too_large_contradicts_no_wiring():
+    """Residuals of a third of it: nothing shows the sign, and no other wiring is tried."""
+    plan = plan_of("0, 90, tx")
+    rng = np.random.default_rng(1)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    noise = CellSettings(sigma_xy_m=2e-8)
+    events = [
+        replace(event, sigma=6e-8) if isinstance(event, Detection) else event
+        for event in plan_events(
+            truth, plan, settings=noise, rng=rng, start_ns=START_NS
+        )
+    ]
+    result = calibrate(gathered(events).collect()[0])
+    names = [failed.name for failed in result.verdict.failed]
+    assert names == ["sign_not_shown", "noise_contradicted"]
+    assert _agree(result)
+    too_small = [
+        replace(failed, size=2 * failed.stated) if "stated" in vars(failed) else failed
+        for failed in result.verdict.failed
+    ]
+    verdict = replace(result.verdict, failed=tuple(too_small))
+    assert not _agree(replace(result, verdict=verdict))
 
 
 def test_another_contradiction_is_not_taken_for_wrong_offsets():
