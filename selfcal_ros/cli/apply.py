@@ -166,9 +166,9 @@ def read_points(text: str, where: str) -> np.ndarray:
     head = [cell.lower() for cell in rows[0][1]] if rows else []
     if tuple(head) not in (AXES, AXES[:2], ENDS):
         raise InputError(
-            f"{where}:1",
+            rows[0][0] if rows else f"{where}:1",
             "the header is not x,y or x,y,theta or x1,y1,x2,y2",
-            "name the columns; positions in m and rad",
+            "begin with one of them, without other columns; positions in m and rad",
         )
     points = np.empty((len(rows) - 1, len(head)))
     for index, (place, cells) in enumerate(rows[1:]):

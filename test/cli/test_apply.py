@@ -155,7 +155,10 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     ("text", "message"),
     [
         ("", "p.csv:1: the header is not x,y or x,y,theta"),
-        ("a,b\n1,2\n", "p.csv:1: the header is not x,y or x,y,theta"),
+        (
+            "# made by hand\nname,y,x\nP,1,2\n",
+            "p.csv:2: the header is not x,y or x,y,theta or x1,y1,x2,y2; begin with one of",
+        ),
         ("x,y\n", "p.csv: it has no points"),
         ("x,y\n1,2,3\n", "p.csv:2: not 2 positions: '1,2,3'; give x,y in m and rad"),
         (

@@ -301,6 +301,15 @@ def test_images_without_ids_show_by_how_many_pitches_a_plate_lies_beside_its_pla
         )
 
 
+def test_reversed_shifts_without_ids_may_also_be_the_sense():
+    """Of images without ids it turns all places by 180°, which shifted views alone show."""
+    found = findings(photographed(in_images(7), {2: -2}).events)
+    assert list(found) == [2]
+    assert "shifted by (-1, +0) pitches, not by (+1, +0) pitches; shift it" in found[2]
+    assert "correct measurement_sense (--sense)" in found[2]
+    assert "leave the joints" not in found[2]
+
+
 def test_plates_that_lie_beside_their_places_in_all_views_do_not_clear_the_joints():
     found = findings(photographed(in_images(7), dict.fromkeys(range(3), 1)).events)
     assert "by (+1, +0) pitches, not by (+0, +0)" in found[0]

@@ -202,9 +202,9 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     rows = csv_rows(text, where)
     if not rows or [cell.lower() for cell in rows[0][1]] != ["position", "error"]:
         raise InputError(
-            f"{where}:1",
+            rows[0][0] if rows else f"{where}:1",
             "the header is not position,error",
-            "name the columns: position in primary units, error in um",
+            "begin with it: position in primary units, error in um",
         )
     values = []
     for place, row in rows[1:]:

@@ -37,6 +37,12 @@ MIRRORS = {
 }
 """Turn, deg, of the mirrored marks (m, -n) -> what the ids are."""
 
+OTHER_SENSE = (
+    "; or, if all shifts are as planned, the other of microscope and plate moves: correct "
+    "measurement_sense (--sense), and find the turn of the camera again, 180° from here"
+)
+"""What explains reversed shifts as well, if no mark has an id."""
+
 
 @dataclass(frozen=True, eq=False)
 class NamedMarks:
@@ -144,12 +150,13 @@ def texts(poses: Mapping[int, SeenPose]) -> dict[int, str]:
     wrong = {
         index: seen_pose for index, seen_pose in poses.items() if not seen_pose.planned
     }
-    right = len(wrong) < len(poses)
-    other_views = (
-        "; other views are as planned: leave the joints and the sense as they are"
-        if right
-        else ""
-    )
+    other_views = ""
+    if _fit_the_other_sense(poses.values()):
+        other_views = OTHER_SENSE
+    elif len(wrong) < len(poses):
+        other_views = (
+            "; other views are as planned: leave the joints and the sense as they are"
+        )
     exchanged = dict(_exchanged(wrong))
     return {
         index: f"{exchanged[index]}{other_views}"
@@ -157,6 +164,22 @@ def texts(poses: Mapping[int, SeenPose]) -> dict[int, str]:
         else seen_pose.text(other_views)
         for index, seen_pose in wrong.items()
     }
+
+
+def _fit_the_other_sense(poses: Iterable[SeenPose]) -> bool:
+    """Return whether the views without ids also lie as planned for the other sense.
+
+    It turns all places by 180°, as another turn of the camera does: shifts show it alone.
+    """
+    return all(
+        not seen_pose.named
+        and seen_pose.pose.found_deg == seen_pose.pose.planned_deg
+        and bool(
+            np.hypot(*np.add(seen_pose.pose.found_shift, seen_pose.pose.planned_shift))
+            < NEAR
+        )
+        for seen_pose in poses
+    )
 
 
 def mirrored_alike(poses: Iterable[SeenPose]) -> str:

@@ -236,7 +236,7 @@ def test_measured_errors_are_opposed():
     ("text", "message"),
     [
         ("", "d.csv:1: the header is not position,error"),
-        ("x,y\n1,2\n", "d.csv:1: the header is not position,error"),
+        ("# mm\nx,y\n1,2\n", "d.csv:2: the header is not position,error; begin with"),
         ("position,error\n1,2\n", "d.csv: 1 measured positions; give at least two"),
         ("position,error\n1,2\n2,x\n", "d.csv:3: not two numbers"),
         ("position,error\n1,2\n2,1_0\n", "d.csv:3: not two numbers"),
