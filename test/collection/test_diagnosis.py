@@ -14,7 +14,8 @@ from selfcal_ros.collection.diagnosis import (
     main_reason,
 )
 from selfcal_ros.collection.inputs import REMEDY, Reason, rejections
-from selfcal_ros.collection.marks.seen_poses import NamedMarks, _fitted
+from selfcal_ros.collection.marks.seen_poses import NamedMarks, SeenPose, _fitted, texts
+from selfcal_ros.estimation.checks.placing import Misplaced
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -301,13 +302,22 @@ def test_images_without_ids_show_by_how_many_pitches_a_plate_lies_beside_its_pla
         )
 
 
-def test_reversed_shifts_without_ids_may_also_be_the_sense():
+@pytest.mark.parametrize(
+    ("lies", "named", "sense"),
+    [((-1, 0), False, True), ((0, 0), False, False), ((-1, 0), True, False)],
+)
+def test_reversed_shifts_without_ids_may_also_be_the_sense(lies, named, sense):
     """Of images without ids it turns all places by 180°, which shifted views alone show."""
-    found = findings(photographed(in_images(7), {2: -2}).events)
-    assert list(found) == [2]
-    assert "shifted by (-1, +0) pitches, not by (+1, +0) pitches; shift it" in found[2]
-    assert "correct measurement_sense (--sense)" in found[2]
-    assert "leave the joints" not in found[2]
+    still = Misplaced("a", 0, 0, (0, 0), (0, 0))
+    moved = Misplaced("tx", 0, 0, (1, 0), lies)
+    poses = {
+        index: SeenPose(pose, planned=not index, mirrored=False, named=named)
+        for index, pose in enumerate((still, moved))
+    }
+    ((index, line),) = texts(poses).items()
+    assert index == 1 and f"the plate lies shifted by ({lies[0]:+}, +0) pitches" in line
+    assert ("correct measurement_sense (--sense)" in line) is sense
+    assert ("leave the joints and the sense as they are" in line) is not sense
 
 
 def test_plates_that_lie_beside_their_places_in_all_views_do_not_clear_the_joints():
