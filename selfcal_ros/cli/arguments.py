@@ -32,6 +32,8 @@ OTHERS = (
     *FORMATS,
 )
 """Endings that say of a file that it is of another kind."""
+TEXTS = ("NAME", "NS", "TEXT", "VALUE")
+"""Names of arguments that may be empty; the others name a file, a number or a choice."""
 SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
 
@@ -112,6 +114,28 @@ def _outputs(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
             and action.metavar not in FOLDERS
         ):
             yield action
+
+
+def check_given(args: argparse.Namespace) -> None:
+    """Refuse an empty file name, number or choice, as of a shell's variable that is not set.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    for action in args.leaf._actions:
+        values = getattr(args, action.dest, None)
+        empty = values == "" or (isinstance(values, list) and "" in values)
+        if empty and action.default != "" and action.metavar not in TEXTS:
+            raise InputError(
+                action.option_strings[-1]
+                if action.option_strings
+                else str(action.metavar),
+                "is empty",
+                "give a value"
+                + ", or leave the option out" * bool(action.option_strings),
+            )
 
 
 def check_existing(args: argparse.Namespace) -> None:

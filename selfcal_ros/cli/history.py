@@ -78,6 +78,10 @@ def _activate(folder: Path, path: Path) -> None:
     if folder.resolve() not in path.resolve().parents:
         raise InputError(str(path), f"is not in {folder}", "copy it there first")
     require_correctable(read_result(path), str(path))
+    if path.suffix != ".json":
+        raise InputError(
+            str(path), "the folder does not list it", "end the name in .json"
+        )
     now = datetime.now(UTC).isoformat(timespec="seconds")
     write_text(
         folder / ACTIVE, f"{path.resolve().relative_to(folder.resolve())}\n{now}\n"

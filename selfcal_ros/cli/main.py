@@ -18,7 +18,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from selfcal_ros import __version__
-from selfcal_ros.cli.arguments import add_force, check_existing, misplaced
+from selfcal_ros.cli.arguments import (
+    add_force,
+    check_existing,
+    check_given,
+    misplaced,
+)
 from selfcal_ros.cli.verbs import (
     EXAMPLES,
     GROUPS,
@@ -169,6 +174,7 @@ def _run(words: list[str]) -> int:
         args = parser.parse_args(words)
         args.words = words
         prefix = args.leaf.prog
+        check_given(args)
         check_existing(args)
         code = int(args.run(args))
         sys.stdout.flush()  # here a full disk is still an error with a line

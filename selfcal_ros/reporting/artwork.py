@@ -72,7 +72,8 @@ def artwork_of(
     Raises
     ------
     InputError
-        If the marks touch each other, or there can be no markers.
+        If the marks touch each other, their lines have no width or fill them, or there can be no
+        markers.
     """
     plate = plan.artifact
     size = size_m * MM_PER_M
@@ -83,9 +84,16 @@ def artwork_of(
         raise InputError(
             "--mark-size",
             f"{size:g} mm, and the marks are {nearest:g} mm apart",
-            f"give a size above 0 and of {most:.3g} mm at most",
+            f"give a size above 0 and of {most:.3g} mm at most, in m",
         )
-    shapes = _shapes(mark, size, width_m * MM_PER_M or size / 5)
+    width = width_m * MM_PER_M or size / 5
+    if not 0 < width < size / 2:
+        raise InputError(
+            "--mark-width",
+            f"{width:g} mm, and a mark has {size:g} mm",
+            f"give a width above 0 and below {size / 2:.3g} mm, in m",
+        )
+    shapes = _shapes(mark, size, width)
     outlines = [shape + place for place in places for shape in shapes]
     low, high = places.min(axis=0), places.max(axis=0)
     step = plate.grid_pitch_m * MM_PER_M if not plate.marks else nearest

@@ -64,6 +64,25 @@ def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
 
 
 @pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("export linuxcnc R.json -o", "--output"),
+        ("plan new --travel 80mm --marks 7 --pitch 10mm -o", "--output"),
+        ("solve bags/hu_exact --quiet --params", "--params"),
+        ("solve bags/hu_exact --quiet --model", "--model"),
+        ("plan check config/plans/hu.yaml --sigma", "--sigma"),
+        ("solve", "BAG"),
+    ],
+)
+def test_a_name_that_is_empty_is_not_a_default(desk, capsys, words, name):
+    """As of a variable of a shell that is not set."""
+    before = set(desk.iterdir())
+    assert main([*words.split(), ""]) == 2
+    assert f": {name}: is empty; give a value" in capsys.readouterr().err
+    assert set(desk.iterdir()) == before
+
+
+@pytest.mark.parametrize(
     "words",
     [
         "export linuxcnc R.json",

@@ -258,6 +258,8 @@ def test_what_cannot_be_is_refused_in_a_line(folder, tmp_path, capsys):
     )
     assert "is not qualified" in refused(folder, "--activate", "bad.json")
     assert "no such file" in refused(folder, "--activate", "c.json")
+    (folder / "map").write_bytes((folder / "a.json").read_bytes())
+    assert "end the name in .json" in refused(folder, "--activate", "map")
     outside = write(tmp_path / "c.json")
     assert "copy it there first" in refused(folder, "--activate", outside)
     assert "is not a folder" in refused(outside)

@@ -374,6 +374,17 @@ def test_marks_that_touch_are_refused(plan, tmp_path, capsys):
     assert "the marks are 1 mm apart" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("width", ["nan", "inf", "-1e-5", "1.5e-4", "0.03"])
+def test_lines_that_fill_their_marks_are_refused(plan, tmp_path, capsys, width):
+    words = ["--mark", "ring", "--mark-size", "3e-4", "--mark-width", width]
+    assert main(["plate", plan, "-o", str(tmp_path / "p.svg"), *words]) == 2
+    assert (
+        "a mark has 0.3 mm; give a width above 0 and below 0.15 mm, in m"
+        in capsys.readouterr().err
+    )
+    assert not (tmp_path / "p.svg").exists()
+
+
 def test_dxf_is_true_to_size(plan, tmp_path):
     ezdxf = pytest.importorskip("ezdxf")
     assert main(["plate", plan, "-o", str(tmp_path / "p.dxf")]) == 0
