@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -228,7 +229,9 @@ class SolvingSession:
         self._stale = False
         self._left_aside = 0
         self._saved = ""  # absolute path of the published map
-        self._unsaved, self._tried_s = "", 0.0  # why it could not be written, and when
+        # results that could not be written, by their files; why, and when it was tried
+        self._unwritten: dict[Path, results.CalibrationResult] = {}
+        self._unsaved, self._tried_s = "", 0.0
         self.shown = Shown()
 
     @property
@@ -447,7 +450,9 @@ class SolvingSession:
         self._saved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
-            self._save_by_itself(outcome.result)
+            path = run_file(self._settings.save_path, job.run.run_id)
+            self._unwritten[path] = outcome.result
+            self._save_by_itself()
 
     def _take_none(self, problem: Exception | None) -> None:
         """Publish why there is no result; raise it unless remaining views may change this."""
@@ -456,30 +461,29 @@ class SolvingSession:
             raise problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
 
-    def _save_by_itself(self, result: results.CalibrationResult) -> None:
-        try:
-            path = run_file(self._settings.save_path, self.shown.run.run_id)
-            write_json(path, results.result_to_dict(results.created_now(result)))
-        except InputError as error:
-            # the map itself is good, and save_map may use another path
-            self._tried_s = self._ports.now_s()
-            if not self._unsaved:
-                self._ports.say(Level.ERROR, f"save_path: {error}")
-            self._unsaved = f"the map is not saved: {error}"
-            return
-        self._saved = str(path)
-        if self._unsaved:
-            self._unsaved = ""
-            self._ports.say(Level.OK, f"the map is saved now: {path}")
+    def _save_by_itself(self) -> None:
+        """Write the results that are not written, each to the file of its run."""
+        for path, result in [*self._unwritten.items()]:
+            try:
+                write_json(path, results.result_to_dict(results.created_now(result)))
+            except InputError as error:
+                # the map itself is good, and save_map may use another path
+                self._tried_s = self._ports.now_s()
+                if not self._unsaved:
+                    self._ports.say(Level.ERROR, f"save_path: {error}")
+                self._unsaved = f"the map is not saved: {error}"
+                return
+            del self._unwritten[path]
+            if result is self.shown.result:
+                self._saved = str(path)
+            if self._unsaved:
+                self._ports.say(Level.OK, f"the map is saved now: {path}")
+        self._unsaved = ""
 
     def save_again(self) -> None:
-        """Write a result that could not be written, some time after the last attempt."""
-        if (
-            self._unsaved
-            and self.shown.result is not None
-            and self._ports.now_s() - self._tried_s >= RETRY_S
-        ):
-            self._save_by_itself(self.shown.result)
+        """Write results that could not be written, some time after the last attempt."""
+        if self._unwritten and self._ports.now_s() - self._tried_s >= RETRY_S:
+            self._save_by_itself()
 
     def _publish(self, result: results.CalibrationResult) -> None:
         shown = self.shown
@@ -586,7 +590,13 @@ class SolvingSession:
         )
         if problem is not None:
             raise problem
-        self._saved, self._unsaved = str(target), ""
+        self._saved = str(target)
+        self._unwritten = {
+            file: result
+            for file, result in self._unwritten.items()
+            if result is not self.shown.result
+        }
+        self._unsaved *= bool(self._unwritten)
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")
         line = (
@@ -641,7 +651,7 @@ class SolvingSession:
             run=PlanRun(result.plan_id, result.run_id),
             views_done=len({without_cell(view.name) for view in result.views}),
         )
-        self._saved = self._unsaved = ""
+        self._saved = ""
         self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"
 

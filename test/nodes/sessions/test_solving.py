@@ -594,6 +594,25 @@ def test_a_map_that_could_not_be_saved_is_saved_once_there_is_space(tmp_path):
     assert not path.exists()
 
 
+def test_a_map_that_waits_for_space_is_written_though_the_next_run_has_none(tmp_path):
+    """The result of the next run is no map: it must not take the place of one."""
+    path = tmp_path / "no" / "map.json"
+    desk = Desk(save_path=str(path), result_folder=str(tmp_path))
+    desk.take(views_of(run_id=str(START_NS)))
+    desk.session.take_command(command(1, run_id=str(START_NS + 1)))
+    desk.take(views_of(run_id=str(START_NS + 1))[:1])
+    told = desk.session.diagnosis()
+    assert f"the map is not saved: {path}" in told.message
+    path.parent.mkdir()
+    desk.hands.pass_time(RETRY_S)
+    desk.session.save_again()
+    written = json.loads(path.read_text())
+    assert written["run_id"] == str(START_NS)
+    assert written["observability"]["identifiable"]
+    told = desk.session.diagnosis()
+    assert "not saved" not in told.message and told.values["saved"] == ""
+
+
 def test_only_regular_files_are_loaded(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, problem in (
