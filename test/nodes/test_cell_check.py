@@ -118,6 +118,8 @@ class FaultyCell(StageSimulator):
         if self.fault == "m reversed" and is_detection and event.kind == 0:
             # an even side has m from -N/2 to N/2 - 1
             event = replace(event, m=-1 - event.m)
+        if self.fault == "m negated" and is_detection and event.kind == 0:
+            event = replace(event, m=-event.m)
         if self.fault == "k shifted" and is_detection and event.kind == 1:
             event = replace(event, k=(event.k + 1) % 8)
         if self.fault == "reversed offset_theta" and is_detection and event.kind == 1:
@@ -302,10 +304,9 @@ def test_a_check_that_an_error_ends_has_failed(graph, monkeypatch):
 
 
 @pytest.mark.usefixtures("short")
-def test_reversed_ids_of_an_even_side_are_named(graph):
-    _, items = checked(
-        graph, "m reversed", plan=plan_of("0, 90, tx", 6, size_y=5, count=8)
-    )
+@pytest.mark.parametrize("fault", ["m reversed", "m negated"])
+def test_reversed_ids_of_an_even_side_are_named(graph, fault):
+    _, items = checked(graph, fault, plan=plan_of("0, 90, tx", 6, size_y=5, count=8))
     assert items["ids"].figure.startswith("m is counted against plate x (")
 
 

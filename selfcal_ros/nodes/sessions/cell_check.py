@@ -2,7 +2,7 @@
 """The session of `selfcal cell check`: a short run that shows the faults of a cell."""
 
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import degrees, isfinite, nan
@@ -18,6 +18,7 @@ from selfcal_ros.collection.inputs import (
     Command,
     Detection,
     EncoderSample,
+    Kind,
     Phase,
     Reason,
 )
@@ -28,11 +29,12 @@ from selfcal_ros.estimation.checks.wiring import (
     wiring_faults,
 )
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, RepeatMotion
+from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes.sessions.cell_faults import (
     FOLLOWS,
+    SAME_SCALE,
     Fault,
     Recorded,
     explaining,
@@ -40,7 +42,14 @@ from selfcal_ros.nodes.sessions.cell_faults import (
 )
 from selfcal_ros.nodes.sessions.health import Level, Ports
 from selfcal_ros.settings.nodes import CollectorSettings
-from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
+from selfcal_ros.units import (
+    MM_PER_M,
+    MRAD_PER_RAD,
+    MS_PER_S,
+    NS_PER_S,
+    S_PER_NS,
+    UM_PER_M,
+)
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
 """Settings of the run: marks per side in the middle of the plate, repeats, check offset."""
@@ -52,6 +61,8 @@ TURNED_DEG = 5.0
 CLEARLY, LEAST_TURN_RAD = 0.25, 2e-4
 """Part of the plate's turn within which lines show it or its opposite, and the least turn for which
 this is not chance."""
+PLACED, PLACED_DEG = 0.1, 0.5
+"""Part of the pitch, and turn, by which the plate may lie beside where it is placed."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 MOST_NAMED = 5
@@ -64,11 +75,14 @@ BACK_S = 0.01
 """Least step of a clock that is told: that of a simulated one may stand still."""
 OLDEST_S = 10.0
 """Largest age of a detection for a valid stamp of exposure."""
+ALL_READ = ("detection clock", "rest", "ids", "marks", "check stops", "signs")
 COVERED = {
-    "commands": ("detection clock", "rest", "ids", "marks", "check stops", "signs"),
+    "encoder rate": ("encoder clock", *ALL_READ),
+    "encoder clock": ALL_READ,
+    "commands": ALL_READ,
     "detection clock": ("rest", "ids", "marks", "check stops", "signs"),
     "rest": ("ids", "marks", "check stops", "signs"),
-    "ids": ("rest", "marks", "check stops", "signs"),
+    "ids": ("detection clock", "rest", "marks", "check stops", "signs"),
     "marks": ("check stops", "signs"),
     "check stops": ("signs",),
     "signs": ("rest", "ids", "marks", "check stops"),
@@ -99,7 +113,9 @@ class CheckItem:
     follows: str = ""
 
 
-def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
+def grouped(
+    items: list[CheckItem], fault: str, earlier: Iterable[str] = ()
+) -> list[CheckItem]:
     """Return the items that passed, then each fault with those that follow from it.
 
     Parameters
@@ -108,11 +124,21 @@ def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
         Checks of the readings, in their order.
     fault : str
         Name of the one that tells the fault, "" = the first that failed.
+    earlier : iterable of str
+        Names of checks before them that failed.
     """
     ordered = [item for item in items if item.passed]
     failed = sorted(
         (item for item in items if not item.passed), key=lambda item: item.name != fault
     )
+    for name in earlier:
+        covered = [
+            item
+            for item in failed
+            if item.name in COVERED.get(name, ()) and item.name != fault
+        ]
+        ordered += [replace(item, remedy="", follows=name) for item in covered]
+        failed = [item for item in failed if item not in covered]
     while failed:
         first, *later_faults = failed
         covered = [
@@ -187,6 +213,7 @@ class CellCheck:
         ] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
         self._n_unknown: Counter[str] = Counter()  # samples of a joint without a number
+        self._n_twice: Counter[str] = Counter()  # samples that name a joint twice
         self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
         self._foreign: dict[
             str, str
@@ -213,9 +240,10 @@ class CellCheck:
     def _note_joints(self, sample: EncoderSample) -> None:
         """Keep the names of joints: all that are wanted, of others so many."""
         where = sample.by_joint
-        for name in sample.names:
+        for name in {*sample.names}:
             if name in self._wanted_joints:
                 self._joints.add(name)
+                self._n_twice[name] += sample.names.count(name) > 1
                 self._n_unknown[name] += not isfinite(where.get(name, nan))
             elif len(self._joints) < MOST_KEPT:
                 self._joints.add(printable(name))
@@ -318,6 +346,17 @@ class CellCheck:
         if aborted is None:
             return
         measured = yield from self._measured()
+        if not self._seen:
+            self._send(Phase.ABORT)
+            self._tell(
+                "commands",
+                False,
+                f"{len(self._encoder)} samples and 0 detections after a MEASURE that "
+                "follows an ABORT",
+                "end the view alone when ABORT arrives: the next PLACE and MEASURE begin "
+                "another one",
+            )
+            return
         yield from self._wait(self._pause_s)
         self._judge_readings(*self._collected())
         revisited = yield from self._revisited()
@@ -552,18 +591,24 @@ class CellCheck:
         settings = self._settings
         stamps, ages = np.array(self._samples).T
         missing = [joint for joint in self._wanted_joints if joint not in self._joints]
-        unknown = {name: count for name, count in self._n_unknown.items() if count}
+        unknown, twice = +self._n_unknown, +self._n_twice
         self._tell(
             "joints",
-            not missing and not unknown,
+            not missing and not unknown and not twice,
             f"heard {printable(', '.join(sorted(self._joints)))}"
             + "".join(
                 f"; {name} without a number in {count} of {len(stamps)} samples"
                 for name, count in unknown.items()
+            )
+            + "".join(
+                f"; {name} twice in {count} of {len(stamps)} samples"
+                for name, count in twice.items()
             ),
             f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
             "measurement_collector"
             if missing
+            else "name each joint once"
+            if twice
             else "publish a position of each joint that is named, NaN is none",
         )
         steps = np.diff(np.sort(stamps)) * S_PER_NS
@@ -594,7 +639,10 @@ class CellCheck:
             "stamp samples when they are taken, by a clock synchronised with this machine's "
             "(NTP, PTP)",
         )
-        return not missing and not unknown
+        *earlier, clock = self.items
+        failed = [item.name for item in earlier if not item.passed]
+        self.items[-1:] = grouped([clock], "", failed)
+        return not missing and not unknown and not twice
 
     def _judge_readings(
         self, measurements: Measurements, progress: ViewProgress
@@ -613,11 +661,21 @@ class CellCheck:
         fault = self._explaining(rejected)
         ids_fit = self._judge_ids(rejected, fault)
         self._judge_loss(progress, rejected, total)
-        follows, signs_told = self._judge_wiring(measurements, progress.check_done)
-        if follows and self.view.angular and ids_fit:
+        # of few stops beside marks taken for others the offsets may show anything
+        stops = (
+            progress.check_done
+            if 2 * progress.check_done > progress.check_expected
+            else 0
+        )
+        follows, signs_told = self._judge_wiring(measurements, stops)
+        if ids_fit and follows:
+            self._judge_placing(measurements)
+        if follows and ids_fit and progress.angular_done:
             self._judge_theta(measurements)
         self.items[first:] = grouped(
-            self.items[first:], "ids" if fault else "signs" * signs_told
+            self.items[first:],
+            "ids" if fault else "signs" * signs_told,
+            [item.name for item in self.items[:first] if not item.passed],
         )
 
     def _judge_stamps(
@@ -682,7 +740,7 @@ class CellCheck:
             if reason not in MISTAKEN
         }
         grid, angular = expected_marks(self.plate, self.view)
-        twice = rejected.get(Reason.DUPLICATE)
+        twice = rejected.get(Reason.DUPLICATE) or self._come_twice()
         self._tell(
             "marks",
             progress.grid_done >= grid
@@ -691,7 +749,7 @@ class CellCheck:
             f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
             f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
             + "".join(f", {count} {reason}" for reason, count in not_mistaken.items()),
-            "publish each detection once"
+            "publish each detection once, with the stamp of its exposure"
             if twice
             else "; ".join(
                 REMEDY.get(Reason(reason), reason) for reason in not_mistaken
@@ -708,6 +766,51 @@ class CellCheck:
             "(docs/start/cell.md)",
         )
 
+    def _come_twice(self) -> bool:
+        """Whether most marks have several offsets, each of them twice: under another stamp."""
+        offsets: dict[tuple[int, int], Counter] = {}
+        for seen in self._detections:
+            if seen.kind == Kind.GRID and seen.has_id:
+                mark = offsets.setdefault((seen.m, seen.n), Counter())
+                mark[seen.offset_x, seen.offset_y] += 1
+        twice = [len(seen) > 1 and min(seen.values()) > 1 for seen in offsets.values()]
+        return 2 * sum(twice) > len(twice)
+
+    def _turn_rad(self, view: ViewReadings) -> float:
+        """Return the turn of the plate by its marks."""
+        x, y = self.plate.places(view.m, view.n)
+        x, y = (self.plate.grid_pitch_m * (row - row.mean()) for row in (x, y))
+        return float((x * view.dy - y * view.dx).sum() / (x**2 + y**2).sum())
+
+    def _judge_placing(self, measurements: Measurements) -> None:
+        """Tell where the plate lies, and how far apart its marks, if that is not as commanded."""
+        [view] = measurements.views
+        shift_m = float(np.mean(view.dx)), float(np.mean(view.dy))
+        turn_deg = degrees(self._turn_rad(view))
+        limit_m = PLACED * self.plate.grid_pitch_m
+        if max(map(abs, shift_m)) > limit_m or abs(turn_deg) > PLACED_DEG:
+            x_mm, y_mm = (part * MM_PER_M for part in shift_m)
+            self._tell(
+                "placing",
+                False,
+                f"the plate lies ({x_mm:+.3g}, {y_mm:+.3g}) mm and {turn_deg:+.2g}° from where "
+                "the view places it",
+                f"place it within {limit_m * MM_PER_M:.3g} mm and {PLACED_DEG:g}°, or set the "
+                "zeros of the encoders",
+            )
+        x, y = (
+            self.plate.grid_pitch_m * row for row in self.plate.places(view.m, view.n)
+        )
+        factors = 1 + np.polyfit(x, view.dx, 1)[0], 1 + np.polyfit(y, view.dy, 1)[0]
+        if max(abs(factor - 1) for factor in factors) > SAME_SCALE:
+            self._tell(
+                "scale",
+                False,
+                f"x is indicated {factors[0]:.4g} times as far as the marks lie apart, y "
+                f"{factors[1]:.4g} times",
+                "correct the scale of the encoders, or grid_pitch of the plan",
+            )
+
     def _judge_theta(self, measurements: Measurements) -> None:
         """Tell whether the lines show the turn of the plate that the marks show, or its opposite.
 
@@ -715,9 +818,7 @@ class CellCheck:
         must show the sign.
         """
         [view] = measurements.views
-        x, y = self.plate.places(view.m, view.n)
-        x, y = (self.plate.grid_pitch_m * (row - row.mean()) for row in (x, y))
-        by_marks = float((x * view.dy - y * view.dx).sum() / (x**2 + y**2).sum())
+        by_marks = self._turn_rad(view)
         by_lines = float(view.dtheta.mean()) if len(view.dtheta) else 0.0
         turned = abs(by_marks) > LEAST_TURN_RAD
         same, reversed_ = (
@@ -745,17 +846,34 @@ class CellCheck:
             remedy = "turn the plate by 1 mrad and check again"
             figure += "" if sign_is_shown else ", too little to tell the sign"
         else:
-            enough = (abs(by_marks) + abs(by_lines)) / CLEARLY * MRAD_PER_RAD
+            enough_rad = (abs(by_marks) + abs(by_lines)) / CLEARLY
             remedy = (
                 "lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
-                f"by 1 mrad and check again; or turn it by {enough:.2g} mrad"
+                "by 1 mrad and check again"
             )
+            if degrees(enough_rad) < PLACED_DEG:
+                remedy += f"; or turn it by {enough_rad * MRAD_PER_RAD:.2g} mrad"
             figure += (
                 ""
                 if same or sign_is_shown
+                else ": offset_theta is the same for all lines"
+                if self._all_lines_alike()
                 else ": neither the same nor the opposite turn"
             )
         self._tell("theta", same or (sign_is_shown and not reversed_), figure, remedy)
+
+    def _all_lines_alike(self) -> bool:
+        """Whether all lines have one offset, which then is not measured."""
+        return (
+            len(
+                {
+                    seen.offset_theta
+                    for seen in self._detections
+                    if seen.kind == Kind.ANGULAR
+                }
+            )
+            == 1
+        )
 
     def _judge_wiring(
         self, measurements: Measurements, stops: int
@@ -820,17 +938,19 @@ def _fault_of_offsets(
     has_stops : bool
         Whether marks were seen from all four sides.
     """
-    turned = _turned_deg(motion) if has_stops else None
-    if (
-        turned is not None
-        and abs(turned) > TURNED_DEG
-        and not (wrong and abs(turned) > 180 - TURNED_DEG)
-    ):
-        return Fault(
-            f"the offsets are turned by {turned:+.1f}° against the stage",
-            "publish offsets along the stage's axes: turn the camera back by this angle, "
-            "or state it (detector: turn)",
-        )
+    response = _response(motion) if has_stops else None
+    if response is not None:
+        mirrored = bool(np.linalg.det(response) < 0)
+        turned = _turned_deg(response @ np.diag([-1, 1]) if mirrored else response)
+        if abs(turned) > TURNED_DEG and not (
+            wrong and (mirrored or abs(turned) > 180 - TURNED_DEG)
+        ):
+            how = f"turned by {turned:+.1f}° against the stage"
+            return Fault(
+                f"the offsets are {'mirrored (x) and ' * mirrored}{how}",
+                f"publish offsets along the stage's axes: {'mirror and ' * mirrored}turn the "
+                f"camera back by this angle, or state it (detector: {'mirror, ' * mirrored}turn)",
+            )
     if wrong:
         return Fault(
             "; ".join(error.what for error in wrong),
@@ -868,10 +988,10 @@ def _spreads_um(motion: RepeatMotion | None) -> tuple[float, float]:
     return float(position), float(offset)
 
 
-def _turned_deg(motion: RepeatMotion | None) -> float | None:
-    """Return by how much the offsets are turned against the stage, counter-clockwise, degrees.
+def _response(motion: RepeatMotion | None) -> np.ndarray | None:
+    """Return the response D of offsets to the stage, (2, 2): an offset is minus D times its motion.
 
-    None if they do not follow it, or are mirrored.
+    None if they do not follow it.
     """
     if motion is None or len(motion.products) != 4:
         return None
@@ -885,10 +1005,13 @@ def _turned_deg(motion: RepeatMotion | None) -> float | None:
     )
     if not np.linalg.det(place) > 0:
         return None
-    response = -cross @ np.linalg.inv(place)  # the offset is minus D times the motion
+    response = -cross @ np.linalg.inv(place)
     explained = np.trace(response @ place @ response.T)
-    if np.linalg.det(response) <= 0 or explained < FOLLOWS * np.trace(offset):
-        return None
+    return None if explained < FOLLOWS * np.trace(offset) else response
+
+
+def _turned_deg(response: np.ndarray) -> float:
+    """Return the turn that a response has, counter-clockwise, degrees."""
     return float(
         np.degrees(
             np.arctan2(response[1, 0] - response[0, 1], response[0, 0] + response[1, 1])

@@ -35,6 +35,8 @@ STILL = 0.25
 """Part of the pitch within which a stage has not moved."""
 FOLLOWS = 0.9
 """Fraction of the variance of an offset that must follow the stage for a valid slope."""
+SAME_SCALE, SAME_UNIT = 0.01, 0.1
+"""Parts by which an axis may be indicated too long: of its length, and of a unit."""
 NEAR_FACTOR = 4.0
 """Factor by which the response of an offset to the stage may differ from -1: a wrong unit makes at
 least 10, a turn or a wrong size of a pixel less."""
@@ -108,8 +110,8 @@ def explaining(recorded: Recorded, settings: CollectorSettings) -> Fault | None:
     if not faults:
         return None
     return Fault(
-        ", or ".join(fault.what for fault in faults),
-        "; or ".join(fault.remedy for fault in faults),
+        ", or ".join(dict.fromkeys(fault.what for fault in faults)),
+        "; or ".join(dict.fromkeys(fault.remedy for fault in faults)),
     )
 
 
@@ -201,6 +203,13 @@ def _standing(recorded: Recorded, settings: CollectorSettings) -> Fault | None:
                 "the whole view",
                 f"move the stage to each mark, and name the joint that moves in joint_{axis}",
             )
+    named = {(mark.m, mark.n) for mark in _marks(recorded)}
+    if len(named) == 1 and len(_marks(recorded)) > 1:
+        m, n = named.pop()
+        return Fault(
+            f"all marks are called ({m}, {n})",
+            "publish m and n of the mark that is seen, or leave ids out (has_id)",
+        )
     lines = {detection.k for detection in _lines(recorded)}
     _, turns = _turns(recorded.samples, settings)
     if (
@@ -223,6 +232,15 @@ def _place(
     where = sample.by_joint
     x, y = (where.get(joint, nan) for joint in (settings.joint_x, settings.joint_y))
     return (x, y) if isfinite(x) and isfinite(y) else None
+
+
+def _marks(recorded: Recorded) -> list[Detection]:
+    """Return the detections that name a grid mark."""
+    return [
+        detection
+        for detection in recorded.detections
+        if detection.kind == Kind.GRID and detection.has_id
+    ]
 
 
 def _lines(recorded: Recorded) -> list[Detection]:
@@ -265,23 +283,25 @@ def _with_marks(recorded: Recorded, ids: Sequence[tuple[int, int]]) -> Recorded:
 
 def _counts(recorded: Recorded) -> Tried:
     """Yield that marks are counted in another direction."""
+    sizes = recorded.plate.shape
     for signs, what in (
         ((-1, 1), "m is counted against plate x"),
         ((1, -1), "n is counted against plate y"),
         ((-1, -1), "m and n are counted against plate x and y"),
     ):
         even_m, even_n = (
-            sign < 0 and size % 2 == 0
-            for sign, size in zip(signs, recorded.plate.shape, strict=True)
+            sign < 0 and size % 2 == 0 for sign, size in zip(signs, sizes, strict=True)
         )
-        ids = [
-            (signs[0] * mark.m - even_m, signs[1] * mark.n - even_n)
-            for mark in recorded.detections
-        ]
-        yield (
-            Fault(what, "m counts the marks along plate x, n along plate y"),
-            _with_marks(recorded, ids),
-        )
+        # an even side is counted from -N/2 to N/2 - 1; without that its signs are reversed alone
+        for one in (1, 0) if even_m or even_n else (0,):
+            ids = [
+                (signs[0] * mark.m - one * even_m, signs[1] * mark.n - one * even_n)
+                for mark in recorded.detections
+            ]
+            yield (
+                Fault(what, "m counts the marks along plate x, n along plate y"),
+                _with_marks(recorded, ids),
+            )
 
 
 def _origins(recorded: Recorded, settings: CollectorSettings) -> Tried:
@@ -327,7 +347,10 @@ def _counts_of_lines(recorded: Recorded, settings: CollectorSettings) -> Tried:
 
 def _offsets(recorded: Recorded, settings: CollectorSettings) -> Tried:
     """Yield that offsets are something else."""
-    for scale, unit in ((1e3, "mm"), (1e6, "µm or pixels")):
+    for scale, unit in (
+        (1e3, "mm"),
+        *((scale, "µm or pixels") for scale in (1e5, 1e6, 1e7)),
+    ):
         yield (
             Fault(f"the offsets are in {unit}", "publish offset_x and offset_y in m"),
             replace(
@@ -342,6 +365,18 @@ def _offsets(recorded: Recorded, settings: CollectorSettings) -> Tried:
                 ],
             ),
         )
+    yield (
+        Fault(
+            "offset_theta is not the offset of a line in rad",
+            "publish offset_theta in rad: line - axis of the stage, counter-clockwise",
+        ),
+        replace(
+            recorded,
+            detections=[
+                replace(line, offset_theta=0.0) for line in recorded.detections
+            ],
+        ),
+    )
     places = _places_at(recorded.detections, recorded, settings)
     yield (
         Fault(
@@ -402,11 +437,80 @@ def _positions(recorded: Recorded, settings: CollectorSettings) -> Tried:
             for sample in recorded.samples
         ]
         yield Fault(what, remedy), replace(recorded, samples=samples)
+    yield from _scales(recorded, settings)
     for what, remedy, factor in (
         ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
         ("theta is indicated in degrees", "publish theta in rad", radians(1.0)),
     ):
         yield Fault(what, remedy), _turned(recorded, settings, factor=factor)
+
+
+def _scales(recorded: Recorded, settings: CollectorSettings) -> Tried:
+    """Yield that axes are indicated too long or too short, by what marks and lines show."""
+    sense = Sense(settings.measurement_sense).sign
+    marks, lines = _marks(recorded), _lines(recorded)
+    view, plate = recorded.view, recorded.plate
+    if not plate.marks:
+        at = _places_at(marks, recorded, settings)
+        m, n = (np.array([getattr(mark, key) for mark in marks]) for key in "mn")
+        x, y = plate.places(m, n)
+        turned = plate.grid_pitch_m * np.exp(1j * view.rotation_rad)
+        sites = sense * turned * (x + 1j * y)
+        along = {
+            settings.joint_x: _longer(at.real, sites.real),
+            settings.joint_y: _longer(at.imag, sites.imag),
+        }
+        yield from _scaled(recorded, along, "marks", (1e3, 1e6))
+    stamps, turns = _turns(recorded.samples, settings)
+    if lines and turns:
+        theta_rad = np.interp([line.stamp_ns for line in lines], stamps, turns)
+        line_rad = 2 * pi * np.array([line.k for line in lines]) / plate.angular_count
+        along = {settings.joint_theta: _longer(theta_rad, sense * line_rad)}
+        yield from _scaled(recorded, along, "lines", (degrees(1.0),))
+
+
+def _longer(indicated: np.ndarray, nominal: np.ndarray) -> float:
+    """Return how many times as far as nominally positions are indicated from one another."""
+    away = nominal - nominal.mean() if len(nominal) else nominal
+    return float(away @ indicated / (away @ away)) if away.any() else 1.0
+
+
+def _scaled(
+    recorded: Recorded,
+    along: Mapping[str, float],
+    of_what: str,
+    units: Sequence[float],
+) -> Tried:
+    """Yield that joints are indicated too long, unless all are in a unit that has its own fault."""
+    wrong = {
+        joint: factor
+        for joint, factor in along.items()
+        if factor > 0 and abs(factor - 1) > SAME_SCALE
+    }
+    has_unit = any(
+        all(abs(factor / unit - 1) < SAME_UNIT for factor in along.values())
+        for unit in units
+    )
+    if not wrong or has_unit:
+        return
+    samples = [
+        _indicating(
+            sample,
+            {
+                joint: sample.by_joint.get(joint, nan) / factor
+                for joint, factor in wrong.items()
+            },
+        )
+        for sample in recorded.samples
+    ]
+    what = "; ".join(
+        f"{joint} is indicated {factor:.4g} times as far as the {of_what} lie apart"
+        for joint, factor in wrong.items()
+    )
+    yield (
+        Fault(what, f"correct unit or scale of {' and '.join(wrong)} (m, rad)"),
+        replace(recorded, samples=samples),
+    )
 
 
 def _placings(recorded: Recorded) -> Tried:
@@ -435,12 +539,7 @@ def _placings(recorded: Recorded) -> Tried:
 
 def _other_origin(recorded: Recorded, settings: CollectorSettings) -> tuple[int, int]:
     """Return by how much m and n are usually higher than those of the mark at the axis."""
-    view, plate = recorded.view, recorded.plate
-    marks = [
-        detection
-        for detection in recorded.detections
-        if detection.kind == Kind.GRID and detection.has_id
-    ]
+    view, plate, marks = recorded.view, recorded.plate, _marks(recorded)
     if plate.marks or not marks:
         return 0, 0
     at = _places_at(marks, recorded, settings)

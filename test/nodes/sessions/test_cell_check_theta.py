@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
-from selfcal_ros.nodes.sessions.cell_check import CellCheck, _turned_deg
+from selfcal_ros.nodes.sessions.cell_check import CellCheck, _response, _turned_deg
 from test.support.ports import Hands, settings_of
 from test.support.sessions import small_plan
 
@@ -75,6 +75,7 @@ def test_offsets_turned_by_any_angle_are_measured(deg):
     c, s = np.cos(np.deg2rad(deg)), np.sin(np.deg2rad(deg))
     moved = np.random.default_rng(1).normal(0, 2e-5, (2, 40))
     both = np.concatenate([moved, -np.array([[c, -s], [s, c]]) @ moved])
-    assert _turned_deg(RepeatMotion(both @ both.T, 39)) == pytest.approx(deg, abs=1e-6)
-    both[3] *= -1
-    assert _turned_deg(RepeatMotion(both @ both.T, 39)) is None  # mirrored
+    response = _response(RepeatMotion(both @ both.T, 39))
+    assert _turned_deg(response) == pytest.approx(deg, abs=1e-6)
+    both[2:] = np.random.default_rng(2).normal(0, 2e-5, (2, 40))
+    assert _response(RepeatMotion(both @ both.T, 39)) is None

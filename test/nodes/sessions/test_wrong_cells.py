@@ -44,6 +44,7 @@ class Cell(Bench):
         self.planned = iter(())
         self.view, self.position, self.late = None, self.home, []  # in transit
         self.noise = np.random.default_rng(1)
+        self.ended = False
         self.came = 1.0  # sign of the last motion along x
 
     def lay(self):
@@ -61,6 +62,7 @@ class Cell(Bench):
         ):
             return
         self.acted, self.planned = stamp, iter(())
+        self.ended |= self.fault == "ends at ABORT" and view.phase == ABORT
         self.work = self.work[:1] if self.fault == "arrives late, right" else []
         self.begun_s = self.hands.seconds  # an exposure that has begun may end
         if view.phase == PLACE:
@@ -95,11 +97,14 @@ class Cell(Bench):
 
     def tick(self):
         """Publish the encoder, and the detection that is due."""
+        if self.ended:
+            return
         now = self.hands.seconds
         if self.work and now >= self.begun_s:
             before, self.position = self.position[0], self.work[0][0]
             self.came = np.sign(self.position[0] - before) or self.came
-        self.check.take_encoder(self.encoder(now))
+        if self.fault != "encoder with gaps" or round(now / TICK_S) % 20 > 8:
+            self.check.take_encoder(self.encoder(now))
         while self.late and self.late[0][0] <= now:
             self.check.take_detection(self.late.pop(0)[1])
         if self.work and now >= self.begun_s + PERIOD_S / 2:
@@ -123,24 +128,33 @@ class Cell(Bench):
             x, y = y, x
         scale = {
             "millimetres": (1e3, 1e3),
+            "x in millimetres": (1e3, 1.0),
+            "inches": (39.37, 39.37),
+            "x a twentieth too long": (1.05, 1.0),
+            "a fiftieth too long": (1.02, 1.02),
             "a tenth": (0.1, 0.1),
             "y does not move": (1.0, 0.0),
         }.get(self.fault, (1.0, 1.0))
         x, y = scale[0] * x, scale[1] * y
         if self.fault.startswith("reversed x"):
             x = -x
-        if self.fault == "reversed theta":
-            theta = -theta
-        if self.fault == "theta in degrees":
-            theta = np.rad2deg(theta)
-        if self.fault == "frozen theta":
-            theta = 0.0
+        theta *= {
+            "reversed theta": -1.0,
+            "theta in degrees": np.rad2deg(1.0),
+            "theta in mrad": 1e3,
+            "frozen theta": 0.0,
+        }.get(self.fault, 1.0)
+        if self.fault == "half a pitch aside":
+            y += 5.1e-3
         if self.fault == "another zero of theta":
             theta += 0.4
         names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
         stamped = 0.0 if self.fault == "one stamp" else now
+        positions = [x, y, theta]
+        if self.fault == "x twice":
+            names, positions = (*names, "x"), [*positions, x]
         return SimpleNamespace(
-            header=self.header(stamped), name=names, position=[x, y, theta]
+            header=self.header(stamped), name=names, position=positions
         )
 
     def show(self, seen, seconds):
@@ -151,12 +165,12 @@ class Cell(Bench):
             seen = before
         if self.fault.startswith("theta reversed"):
             seen["offset_theta"] *= -1
-        if self.fault.startswith("camera turned"):
-            turned = np.exp(1j * np.deg2rad(float(self.fault.split()[2]))) * (
+        if "camera turned" in self.fault:
+            turned = np.exp(1j * np.deg2rad(float(self.fault.split()[-1]))) * (
                 seen["offset_x"] + 1j * seen["offset_y"]
             )
             seen = seen | {"offset_x": turned.real, "offset_y": turned.imag}
-        if self.fault == "mirrored camera":
+        if self.fault.startswith("mirrored camera"):
             seen = seen | {"offset_x": -seen["offset_x"]}
         if self.fault == "offsets in mm":
             seen = seen | {key: 1e3 * seen[key] for key in ("offset_x", "offset_y")}
@@ -181,6 +195,12 @@ class Cell(Bench):
             "offset_theta in degrees": {
                 "offset_theta": np.degrees(seen["offset_theta"])
             },
+            "offset_theta in mrad": {"offset_theta": 1e3 * seen["offset_theta"]},
+            "no offset_theta": {"offset_theta": 0.0},
+            "offsets in pixels": {
+                key: 2e5 * seen[key] for key in ("offset_x", "offset_y")
+            },
+            "one id": {"m": 0, "n": 0},
             "m reversed": {"m": -seen["m"]},
             "n reversed": {"n": -seen["n"]},
             "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
@@ -194,9 +214,10 @@ class Cell(Bench):
             "arrives late": 11.0,
             "arrives late, right": 2.0,
         }.get(self.fault, 0.0)
-        for _ in range(2 if self.fault == "publishes twice" else 1):
+        again_s = {"publishes twice": [0.0], "stamps twice": [1e-6]}.get(self.fault, [])
+        for more_s in (0.0, *again_s):
             self.late.append(
-                (arrives, SimpleNamespace(header=self.header(seconds), **seen))
+                (arrives, SimpleNamespace(header=self.header(seconds + more_s), **seen))
             )
 
     def header(self, seconds):
@@ -305,6 +326,25 @@ WRONG = [
     ("counts from a corner", "ids", "the one in the middle is called (1, 1) (54"),
     ("counts from one", "ids", "the one in the middle is called (2, 2) (54"),
     ("publishes twice", "marks", "54 of 108 detections used, 54 duplicate"),
+    ("stamps twice", "marks", "108 of 108 detections used"),
+    ("ends at ABORT", "commands", "0 samples and 0 detections after a MEASURE that"),
+    ("encoder with gaps", "encoder rate", "largest 500 ms"),
+    ("x twice", "joints", "heard theta, x, y; x twice in 4"),
+    ("one id", "ids", "all marks are called (0, 0) (54"),
+    ("x in millimetres", "ids", "x is indicated 1000 times as far as the marks lie"),
+    ("x a twentieth too long", "ids", "x is indicated 1.05 times as far as the marks"),
+    ("a fiftieth too long", "scale", "x is indicated 1.02 times as far as the marks"),
+    (
+        "inches",
+        "ids",
+        "x is indicated 39.37 times as far as the marks lie apart; y is indicated 39.37",
+    ),
+    ("theta in mrad", "ids", "theta is indicated 1000 times as far as the lines lie"),
+    ("offset_theta in mrad", "ids", "offset_theta is not the offset of a line in rad"),
+    ("no offset_theta", "theta", "+0.000 mrad: offset_theta is the same for all lines"),
+    ("offsets in pixels", "ids", "the offsets are in µm or pixels (54"),
+    ("mirrored camera turned 45", "signs", "mirrored (x) and turned by -45.0° against"),
+    ("half a pitch aside", "placing", "+5.13) mm and"),
     ("one stamp", "encoder rate", "samples, all with one stamp"),
     ("reversed theta", "ids", REVERSED_THETA),
     ("k reversed", "ids", REVERSED_THETA),
@@ -364,6 +404,14 @@ REMEDIES = {
     "node alone publishes detections (ros2 topic info -v)",
     "old stamps": "stamp detections at the instant of exposure",
     "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
+    "stamps twice": "publish each detection once, with the stamp of its exposure",
+    "ends at ABORT": "end the view alone when ABORT arrives",
+    "x twice": "name each joint once",
+    "one id": "publish m and n of the mark that is seen",
+    "x in millimetres": "correct unit or scale of x (m, rad)",
+    "inches": "correct unit or scale of x and y (m, rad)",
+    "millimetres": "publish joint positions in metres",
+    "half a pitch aside": "place it within 1 mm and 0.5°",
     "theta in degrees": "publish theta in rad",
     "frozen theta": "turn the stage to each line",
     "k shifted": "count k from the line along plate x, and set theta to 0",
