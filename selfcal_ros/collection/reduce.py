@@ -30,6 +30,7 @@ from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
+from selfcal_ros.units import S_PER_NS
 
 
 @dataclass(frozen=True)
@@ -459,7 +460,8 @@ class UnnamedImages:
             return 0, 0.0
         stamps = np.unique(self.detections["stamp"])
         by = abs(late)
-        return late, float(np.median(stamps[by:] - stamps[: len(stamps) - by])) * 1e-9
+        late_ns = np.median(stamps[by:] - stamps[: len(stamps) - by])
+        return late, float(late_ns * S_PER_NS)
 
     def exposures_late(self) -> int:
         """Return by how many exposures they are late; 0 if they are not.

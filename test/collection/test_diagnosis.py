@@ -362,7 +362,8 @@ def test_images_of_another_exposure_are_named(size, by):
     measured = gathered(late.events).collect()[0]
     assert not any(view.used for view in measured.views)
     taken = f"taken {abs(by)} exposure{'s' * (abs(by) > 1)} {'before' if by > 0 else 'after'}"
-    assert f"each image was {taken} its stamp, about" in findings(late.events)[None]
+    about = f"about {abs(by) * exposure / S:.2g} s"
+    assert f"each image was {taken} its stamp, {about}" in findings(late.events)[None]
 
 
 def in_images(size):
