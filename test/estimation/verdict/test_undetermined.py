@@ -34,6 +34,7 @@ def measured(
     alike=True,
     noise_m=20e-9,
     sense=Sense.MICROSCOPE_MOVES,
+    plate=PLATE,
 ):
     """Return readings of Hu's views, which drift, as a rule all alike, and the truth."""
     rng = np.random.default_rng(seed)
@@ -43,11 +44,11 @@ def measured(
         spread = replace(
             spread, drift_quadratic_m=2 * drift_m, drift_cubic_m=2 * drift_m
         )
-    truth = random_truth(PLATE, 4, rng, spread)
+    truth = random_truth(plate, 4, rng, spread)
     if alike:
         first = truth.drift_m[:1]
         truth = replace(truth, drift_m=first.repeat(len(truth.drift_m), axis=0))
-    plan = hu_plan(PLATE, repeats)
+    plan = hu_plan(plate, repeats)
     plan = replace(
         plan,
         views=tuple(
@@ -112,6 +113,15 @@ def test_drifts_as_large_as_is_assumed_are_no_strain_of_the_plate():
             datum_modes(PLATE, scale=True),
         )
         assert np.mean(np.abs(error) < 2 * u_of(result)) > 0.85
+
+
+@pytest.mark.parametrize(("size", "in_model"), [(5, False), (6, True)])
+def test_few_marks_leave_a_drift_in_u_alone(size, in_model):
+    """Its coefficients would leave 5 x 5 marks too few degrees of freedom for their noise."""
+    readings, _ = measured(repeats=1, plate=Artifact(size, 0.01, 24))
+    result = calibrate(readings, Options())
+    assert ("drift" in {term.name for term in result.model.terms}) is in_model
+    assert lines(result)["drift"].effect_rms > 5e-9
 
 
 def test_its_nodes_are_correlated_as_by_the_declared_term():
