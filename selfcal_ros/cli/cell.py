@@ -147,7 +147,11 @@ def _look(args: argparse.Namespace, trial: Trial, output: str) -> int:
         raise
     at = zip(trial.position.names, trial.position.positions, strict=True)
     print(
-        "position: " + ", ".join(f"{axis} {value + 0.0:.6g}" for axis, value in at),
+        "position: "
+        + ", ".join(
+            f"{axis} {value + 0.0:.6g} {'rad' if axis == 'theta' else 'm'}"
+            for axis, value in at
+        ),
         file=aside(args),
     )
     if pixels is not None:

@@ -161,6 +161,9 @@ class Visitor:
     step_ns : int
         Largest time between two positions that are told, on the line between two readings; rest
         is two readings that agree after half of it.
+    of_a_move : int
+        Least number of positions told on the line of a move, so that the direction of a fast one
+        is known.
     consecutive : bool
         All repeats of a mark or line one after another.
     detects : bool
@@ -172,6 +175,7 @@ class Visitor:
     clock: Clock = field(default_factory=Clock)
     seed: int = 0
     step_ns: int = TRACK_NS
+    of_a_move: int = 4
     consecutive: bool = False
     detects: bool = True
 
@@ -447,7 +451,7 @@ class Visitor:
         if last is None or departure.stamp_ns - last.stamp_ns > self.step_ns:
             # what was read at rest meanwhile may have been told
             self._untold.append(departure)
-        self._untold += self._track(departure, arrival)
+        self._untold += self._track(departure, arrival, least=self.of_a_move)
         return arrival
 
     def _where_it_was_left(self) -> EncoderSample:
@@ -681,19 +685,18 @@ class Visitor:
         yield from sorted(events, key=lambda event: event.stamp_ns)
 
     def _track(
-        self, before: EncoderSample, after: EncoderSample
+        self, before: EncoderSample, after: EncoderSample, *, least: int = 0
     ) -> Iterator[EncoderSample]:
         """Yield the second of two positions, and before it others on the line between them.
 
         The encoder of a machine that is asked for its position has no gap, and the direction of
         its last motion is known.
         """
-        count = (after.stamp_ns - before.stamp_ns - 1) // self.step_ns
+        length_ns = after.stamp_ns - before.stamp_ns
+        count = min(max((length_ns - 1) // self.step_ns, least), length_ns - 1)
         for number in range(1, count + 1):
             fraction = number / (count + 1)
-            stamp = before.stamp_ns + round(
-                fraction * (after.stamp_ns - before.stamp_ns)
-            )
+            stamp = before.stamp_ns + round(fraction * length_ns)
             yield EncoderSample(
                 stamp,
                 after.names,

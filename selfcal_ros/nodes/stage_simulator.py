@@ -99,6 +99,7 @@ class StageSimulator(CellNode[SimulatorSettings]):
             settings.seed,
             consecutive=settings.consecutive,
             step_ns=self._step_ns,
+            of_a_move=0,
             detects=self._camera is None,
         )
         if plan.plan_id == CHECK_ID:

@@ -75,6 +75,23 @@ def test_the_map_is_right_within_its_uncertainty(tmp_path, camera, sense):
     assert np.abs(machine.truth.g).max() > 2e-7
 
 
+def test_the_direction_of_fast_moves_is_known_with_an_encoder_that_is_noisy(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    rng, clock = np.random.default_rng(1), Jumping()
+
+    class Noisy(Spoilt):
+        """A stage whose moves take no time, and its answers 20 ms."""
+
+        def position(self):
+            clock.sleep(0.02)
+            return tuple(np.add(super().position(), rng.normal(0, 3e-9, 3)))
+
+    run_of(tmp_path, Noisy(machine), cell, clock).measure()
+    measured = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
+    unknown = [view.visits.approach_x == 0 for view in measured.views]
+    assert not np.concatenate(unknown).any()
+
+
 def test_nothing_moves_beyond_the_limits(tmp_path):
     cell, machine = write_cell(tmp_path, plan=PLAN.replace("0.001", "0.0101"))
     spoilt = Spoilt(machine)

@@ -71,6 +71,7 @@ def test_exposures_come_in_their_period_with_samples_at_their_rate(period_s, rat
         Plan("p", PLATE, (View("a", repeats=2),)),
         settings,
         step_ns=round(1e9 / rate_hz),
+        of_a_move=0,
     )
     stamps = np.array([event.stamp_ns for event in told])
     assert (np.diff(stamps) > 0).all()
