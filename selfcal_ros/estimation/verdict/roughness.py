@@ -367,7 +367,6 @@ class _Further:
         places_m = known_places(coarse)
         grid = fine.grid
         spline = grid.views.spline
-        nodes = coarse.grid.views.spline
         matrix, couple = grid.matrix, grid.coupling
         b, d = grid.right_side(y)
         within = np.linalg.pinv(grid.block, hermitian=True, rcond=GAP)
@@ -376,11 +375,9 @@ class _Further:
         normal = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
         normal -= elimination @ coupling.T
         right = np.stack([b.real, b.imag]) - (elimination @ d).reshape(2, -1)
-        contained = nodes.within(spline)
-        # Z = 0 of what the coarse map contains: e along the other directions alone
-        directions = qr(contained)[0][:, contained.shape[1] :]
-        at_nodes = spline.rows(nodes.places_m.ravel()) @ directions
-        further = directions - contained @ at_nodes
+        contained = coarse.grid.views.spline.within(spline)
+        # what Z has at the nodes is of the coarse map, which is eliminated
+        further = qr(contained)[0][:, contained.shape[1] :]
         inverse = np.linalg.pinv(
             _between(contained, normal, contained), hermitian=True, rcond=GAP
         )
