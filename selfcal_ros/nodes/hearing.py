@@ -6,8 +6,9 @@ The listeners of others do not count.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -72,6 +73,18 @@ def others_on(node: Node, topic: str, own_nodes: Iterable[str]) -> list[str]:
     """Return the nodes that publish on a topic beside `own_nodes`, each of which may once."""
     found = Counter(map(node_of, publishers_of(node, topic)))
     return [*(found - Counter(own_nodes))]
+
+
+def others_serving(node: Node, service: str, own_node: str) -> list[str]:
+    """Return the nodes beside `own_node` that answer requests to a service."""
+    others = []
+    for name, namespace in node.get_node_names_and_namespaces():
+        full_name = f"{namespace.rstrip('/')}/{name}"
+        if full_name != own_node:
+            with suppress(NodeNameNonExistentError):
+                served = node.get_service_names_and_types_by_node(name, namespace)
+                others += [full_name] * (service in dict(served))
+    return others
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str:

@@ -43,8 +43,9 @@ IMAGE_DEPTH = 32
 """Images kept for subscribers that have not acknowledged them."""
 BURST, SLICE_S = 100, 0.02
 """Messages between checks of the time and of the subscribers' progress; longest step."""
-LOOK_S = 1.0
-"""Time for finding other publishers before the first message, and between looks after it."""
+LOOK_S, FIRST_LOOK_S = 1.0, 4.0
+"""Time between looks for other publishers, and for finding them before the first message: on a busy
+machine DDS may miss all but the announcements that each participant repeats every 3 s."""
 NAME_S = 10.0
 """Longest wait for the name of a node whose publishers are found before it."""
 UNHEARD_RATE = 4000
@@ -233,7 +234,7 @@ class Player:
                 f"{name} publishes {', '.join(topics)} as well; {self._at} messages were played",
                 "end it, or play in another ROS domain",
             )
-        return not other_nodes and (looked_s >= LOOK_S or not self.alone_on)
+        return not other_nodes and (looked_s >= FIRST_LOOK_S or not self.alone_on)
 
     def _other_publishers(self) -> dict[str, list[str]]:
         """Return who else publishes on which topics; selfcal's nodes may, on topics of their own.

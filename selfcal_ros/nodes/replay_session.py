@@ -17,9 +17,10 @@ from rclpy.task import Future
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.hearing import others_serving
 from selfcal_ros.nodes.player import IMAGES, Player
 from selfcal_ros.nodes.running import run
 from selfcal_ros.settings.nodes import PlayerSettings
@@ -70,9 +71,22 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         deaf = self.player.deaf()
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
         if self.player.is_alone() and not deaf and ready:
+            self._refuse_other_servers()
             self._go(self._play)
         elif self._late():
             self._end(" and ".join(deaf) or "no services of collector and solver")
+
+    def _refuse_other_servers(self) -> None:
+        """Refuse a domain in which somebody else may answer a request of this session."""
+        for client in (self._finish, self._save):
+            service = self.resolve_service_name(client.srv_name)
+            for other in others_serving(self, service, service.rpartition("/")[0]):
+                raise InputError(
+                    f"ROS domain {self.context.get_domain_id()}",
+                    f"{other} answers {service} as well; "
+                    f"{self.player.played} messages were played",
+                    "end it, or play in another ROS domain",
+                )
 
     def _play(self) -> None:
         self.player.step()
@@ -105,6 +119,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         )
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:
+        self._refuse_other_servers()
         answer = client.call_async(request)
 
         def wait() -> None:

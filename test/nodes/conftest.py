@@ -72,6 +72,7 @@ def short_look(monkeypatch):
     from selfcal_ros.nodes import player
 
     monkeypatch.setattr(player, "LOOK_S", 0.05)
+    monkeypatch.setattr(player, "FIRST_LOOK_S", 0.05)
 
 
 @pytest.fixture

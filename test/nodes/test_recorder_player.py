@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """bag_player and bag_recorder: what one plays the other writes, all of it."""
 
+import time
 from collections import Counter
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,7 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.model.readings import readings_digest
-from selfcal_ros.nodes import names
+from selfcal_ros.nodes import names, player
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -333,6 +334,14 @@ def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     graph.until(player.finished.done, "its end")
     assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 0)
+
+
+def test_others_are_looked_for_until_dds_has_repeated_itself(graph, bag, monkeypatch):
+    monkeypatch.setattr(player, "FIRST_LOOK_S", 0.5)
+    begun_s = time.monotonic()
+    node = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
+    graph.until(lambda: node.player.played, "the first message")
+    assert time.monotonic() - begun_s >= 0.5
 
 
 def test_a_publisher_that_comes_while_a_bag_is_played_ends_the_player(graph, bag):

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from rclpy.node import Node
 from selfcal_msgs.srv import SaveMap
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -488,6 +489,16 @@ def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(
     )
 
 
+def serve(graph, finish=lambda _, answer: answer, save=lambda _, answer: answer):
+    """Answer the requests of a session as collector and solver do."""
+    for name, kind, service, answer in (
+        ("measurement_collector", Trigger, "~/finish", finish),
+        ("solver", SaveMap, "~/save_map", save),
+    ):
+        node = graph.add(Node(name, context=graph.context))
+        node.create_service(kind, service, answer)
+
+
 def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(
     graph,
 ):
@@ -502,8 +513,7 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
         response.success = True
         return response
 
-    graph.hand.create_service(Trigger, "measurement_collector/finish", answer)
-    graph.hand.create_service(SaveMap, "solver/save_map", save)
+    serve(graph, answer, save)
     solver = graph.hand.create_publisher(String, "solver/solved", names.SOLVED.qos)
 
     def tell(text):
@@ -560,6 +570,30 @@ def test_a_session_plays_nothing_where_somebody_else_publishes(
     )
 
 
+def test_a_session_plays_nothing_where_somebody_else_answers_its_requests(graph, capfd):
+    serve(graph)
+    graph.add(Node("stranger", context=graph.context)).create_service(
+        SaveMap, "/solver/save_map", lambda _, response: response
+    )
+    player = SimpleNamespace(
+        deaf=list,
+        alone_on=[],
+        is_alone=lambda: True,
+        played=0,
+        playlist=SimpleNamespace(lost=[]),
+    )
+    session = graph.add(
+        ReplaySession(lambda _: player, "map.json", context=graph.context)
+    )
+    graph.until(session.finished.done, "the end of the session")
+    domain = graph.context.get_domain_id()
+    assert session.exit_code == 2
+    assert capfd.readouterr().err == (
+        f"selfcal replay: ROS domain {domain}: /stranger answers /solver/save_map as well; "
+        "0 messages were played; end it, or play in another ROS domain\n"
+    )
+
+
 def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
     player = SimpleNamespace(
         deaf=list,
@@ -576,10 +610,7 @@ def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
         heard={"encoder": 9, "detection": 2},
         playlist=SimpleNamespace(lost=[]),
     )
-    graph.hand.create_service(
-        Trigger, "measurement_collector/finish", lambda _, answer: answer
-    )
-    graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
+    serve(graph)
     session = graph.add(
         ReplaySession(lambda _: player, "map.json", context=graph.context)
     )
@@ -608,10 +639,7 @@ def test_nothing_is_played_before_the_nodes_listen(graph):
         heard={},
         playlist=SimpleNamespace(lost=[]),
     )
-    graph.hand.create_service(
-        Trigger, "measurement_collector/finish", lambda _, answer: answer
-    )
-    graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
+    serve(graph)
     session = graph.add(
         ReplaySession(lambda _: player, "map.json", context=graph.context)
     )
