@@ -428,7 +428,7 @@ def error_map(message: Any) -> ErrorMap:
         np.array(getattr(message, name), dtype=float)
         for name in ("g_theta", "u_g_theta")
     )
-    _refuse_not_finite(grids, valid, g_theta)
+    _refuse_not_finite(grids, valid, g_theta, u_g_theta)
     for values in grids.values():
         values[~valid] = np.nan
     return ErrorMap(
@@ -443,7 +443,10 @@ def error_map(message: Any) -> ErrorMap:
 
 
 def _refuse_not_finite(
-    grids: dict[str, np.ndarray], valid: np.ndarray, g_theta: np.ndarray
+    grids: dict[str, np.ndarray],
+    valid: np.ndarray,
+    g_theta: np.ndarray,
+    u_g_theta: np.ndarray,
 ) -> None:
     """Refuse a map that is not finite where it is said to be known, or known nowhere."""
     for name in ("gx", "gy"):
@@ -454,8 +457,8 @@ def _refuse_not_finite(
                 f"{name} is not finite at {bad} of the {int(valid.sum())} valid sites",
                 "correct the publisher",
             )
-    for name in ("u_gx", "u_gy"):
-        if (grids[name] < 0).any():
+    for name, u in {**grids, "u_g_theta": u_g_theta}.items():
+        if name.startswith("u_") and (u < 0).any():
             raise InputError(
                 ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher"
             )

@@ -20,7 +20,11 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import digests_of, result_to_dict
-from selfcal_ros.nodes.sessions.compensating import KEEPS_UP, CompensatingSession
+from selfcal_ros.nodes.sessions.compensating import (
+    KEEPS_UP,
+    MOST_ASKED,
+    CompensatingSession,
+)
 from selfcal_ros.nodes.sessions.health import Level
 from selfcal_ros.reporting.summary.numbers import summary_figures
 from selfcal_ros.reporting.words.findings import worded
@@ -250,6 +254,7 @@ def test_positions_outside_the_field_are_counted_and_told_once(desk):
         ([0.0], [], [], "1 x, 0 y and 0 theta"),
         ([0.0], [0.0], [0.0, 1.0], "1 x, 1 y and 2 theta"),
         ([math.nan], [0.0], [], "a position is not a number"),
+        ([0.0] * (MOST_ASKED + 1), [0.0], [], "ask for 100000 at a time"),
         ([-0.02], [-0.02], [], "next to an unknown site"),
     ],
 )
@@ -535,6 +540,7 @@ MILLIRADIAN_REACH = 1e-3 / np.hypot(0.02, 0.02)
             "gx is not finite at 1 of the 25 valid sites",
         ),
         ({"u_gy": with_value(ONE.gy, -1e-9)}, "u_gy is negative"),
+        ({"u_g_theta": with_value(ONE.g_theta, -1e-9)}, "u_g_theta is negative"),
         (
             {"gy": with_value(ONE.gy, -math.inf)},
             "gy is not finite at 1 of the 25 valid sites",
