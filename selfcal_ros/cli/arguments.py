@@ -69,7 +69,8 @@ USES = {
     CELL: "`selfcal cell try {}` shows what its machine sees",
     PARAMETERS: "give it with --params",
     CAL: "`selfcal cal check {}` reads it",
-    TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points",
+    TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points; readings have to be in a "
+    "bag (docs/reference/bags.md)",
     PROGRAM: "`selfcal gcode {} RESULT.json -o OUT` corrects it",
 }
 """Kind of file -> what it is good for, with its name."""

@@ -6,7 +6,7 @@ from functools import cache
 
 from selfcal_ros.blocks import traits_of
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
-from selfcal_ros.estimation.checks.placing import check_placing
+from selfcal_ros.estimation.checks.placing import check_moved, check_placing
 from selfcal_ros.estimation.checks.wiring import (
     AS_IS,
     OTHER_LINES,
@@ -127,7 +127,8 @@ def calibrate(
 
 
 def require_placed(result: CalibrationResult, measurements: Measurements) -> None:
-    """Raise PlacingError if a result is not good because the plate is not placed as planned."""
+    """Raise PlacingError if the plate was not moved, or its pose is why a result is not good."""
+    check_moved(measurements)
     if not (
         result.verdict.qualified and any(view.dof_xy for view in measurements.views)
     ):

@@ -13,6 +13,10 @@ nodes of the map are apart. Of images in three views or more the marks on the op
 compared, of fewer views those of the cells beside it as well, each cell as a view of its own. Of
 1,000 clean simulated measurements on the lattice none was refused, and 200 wrongly placed plates
 were named.
+
+A plate that was not moved between two views gives every site the same reading in both: that agrees
+with a plate without errors, and the map is that of stage and plate together. No placing repeats
+within `PLACED_AGAIN_M`.
 """
 
 from collections.abc import Callable, Iterator
@@ -55,6 +59,8 @@ STEPS = (-2, -1, 1, 2)
 """Steps along a row of marks by which a plate is tried beside its place."""
 SAME_MARK = 0.1
 """Distance, in pitches, within which a mark at another pose lies on a mark of a list."""
+PLACED_AGAIN_M = 1e-7
+"""Motion between two views, m, below which the plate was not placed anew: no placing repeats so."""
 ON_MARKS = 0.8
 """Part of the readings of a view that another pose must have on marks."""
 
@@ -127,6 +133,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     """
     artifact = measurements.artifact
     compared_views = _compared_views(measurements)
+    if unmoved := _unmoved(measurements, compared_views):
+        return unmoved
     views = [readings for _, readings in compared_views]
     if len(views) < 3:
         return None
@@ -182,6 +190,53 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
     return Misplaced.of(view.plan_view, planned_pose, pose)
+
+
+def check_moved(measurements: Measurements) -> None:
+    """Raise PlacingError if the plate was not moved before a view of another pose."""
+    if fault := _unmoved(measurements, _compared_views(measurements)):
+        raise placing_error(fault, f"plan '{measurements.plan_id}', ")
+
+
+def _unmoved(
+    measurements: Measurements, compared_views: list[tuple[View, _WindowReadings]]
+) -> Misplaced | None:
+    """Return the first view whose plate was not moved since an earlier one, as placed there."""
+    for later, (view, readings) in enumerate(compared_views):
+        for earlier_view, earlier in compared_views[:later]:
+            if (
+                view.cell == earlier_view.cell
+                and readings.pose != earlier.pose
+                and _lies_as_before(measurements, earlier, readings)
+            ):
+                return Misplaced.of(view.plan_view, readings.pose, earlier.pose)
+    return None
+
+
+def _lies_as_before(
+    measurements: Measurements, earlier: _WindowReadings, later: _WindowReadings
+) -> bool:
+    """Return whether the marks of two views lie at the same places of the stage, within noise."""
+    earlier_site, later_site = (
+        np.round(readings.place / SAME_MARK) for readings in (earlier, later)
+    )
+    _, first, second = np.intersect1d(earlier_site, later_site, return_indices=True)
+    if len(first) < LEAST_READINGS:
+        return False
+    noise, spread = _sizes(measurements, [earlier, later])
+    noise = max(noise, LEAST_NOISE_M)
+    if not spread > 2 * noise:
+        return False
+    moved = later.deviation[second] - earlier.deviation[first]
+    z = later.place[second] / WINDOW
+    columns = np.stack([np.ones(len(z)), 1j * z], axis=1)
+    lies = np.linalg.lstsq(columns, moved, rcond=None)[0]
+    residuals = moved - columns @ lies
+    scatter = np.sqrt(np.sum(np.abs(residuals) ** 2) / (4 * (len(z) - 2)))
+    motion = np.sqrt(np.mean(np.abs(columns @ lies) ** 2))
+    return bool(
+        scatter**2 < CONTRADICTED * noise**2 and motion < max(PLACED_AGAIN_M, scatter)
+    )
 
 
 def _compared_views(measurements: Measurements) -> list[tuple[View, _WindowReadings]]:

@@ -128,6 +128,58 @@ def test_single_readings_that_are_off_are_not_a_plate_that_lies_otherwise():
         assert misplaced(replace(readings, views=tuple(views))) is None
 
 
+def laid_once(readings, rng, *, again_m=0.0, noise_m=1.4e-8):
+    """Return readings of a plate that stays where it is, but for a motion, m, in the last view."""
+    plate, (first, *_) = readings.artifact, readings.views
+
+    def sites(view):
+        i, j = view.view.on_stage(plate).site_of(*plate.places(view.m, view.n))
+        return list(zip(np.round(i).tolist(), np.round(j).tolist(), strict=True))
+
+    seen = dict(zip(sites(first), np.stack([first.dx, first.dy], 1), strict=True))
+    views = []
+    for number, view in enumerate(readings.views):
+        at = np.array([seen[site] for site in sites(view)])
+        at = at + again_m * (number == len(readings.views) - 1)
+        at = at + rng.normal(0, noise_m, at.shape)
+        views.append(replace(view, dx=at[:, 0], dy=at[:, 1]))
+    return replace(readings, views=tuple(views))
+
+
+@pytest.mark.parametrize("planned", ["0, 90, tx", "0, 90, tx, ty", "0, tx, 90"])
+@pytest.mark.parametrize("repeated", [True, False])
+def test_a_plate_that_was_not_moved_is_not_one_without_errors(planned, repeated):
+    """The map would be that of stage and plate together, within its noise."""
+    readings, names = read(planned, planned)
+    still = laid_once(readings, np.random.default_rng(5))
+    still = still if repeated else unrepeated(still)
+    with pytest.raises(PlacingError) as error:
+        calibrate(still)
+    assert str(error.value).startswith(
+        f"plan '{readings.plan_id}', view '{names[1]}': the plate lies "
+    )
+    found = misplaced(still)
+    assert found.found_deg == 0 and np.abs(found.found_shift).max() == 0
+
+
+def test_a_view_that_was_not_placed_anew_is_named_among_others():
+    readings, names = read("0, 90, tx", "0, 90, tx")
+    still = laid_once(readings, np.random.default_rng(6))
+    views = (*readings.views[:2], still.views[2])
+    found = misplaced(replace(readings, views=views))
+    assert found is not None and found.view == names[2]
+
+
+def test_a_plate_without_errors_is_not_one_that_was_not_moved():
+    """Placed again it lies elsewhere by more than noise."""
+    readings, _ = read("0, 90, tx", "0, 90, tx")
+    rng = np.random.default_rng(7)
+    truth = random_truth(readings.artifact, 3, rng)
+    truth = replace(truth, a=0.0 * truth.a)
+    plan = plan_of("0, 90, tx", 7, count=0, repeats=2)
+    assert misplaced(simulate_measurements(truth, plan, rng, sigma_m=2e-8)) is None
+
+
 def unrepeated(readings):
     """Return readings of which nothing tells the noise of repeats."""
     return replace(

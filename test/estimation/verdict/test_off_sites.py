@@ -63,8 +63,8 @@ def readings(
         turned = np.array([(m, n), (-n, m)][quarter]) + np.array([[a], [b]])
         here = (abs(turned) <= (N - 1) // 2).all(axis=0)
         site = turned[:, here] * PITCH_M
-        # a plate without errors, laid down beside its place
-        mark = site + beside[:, None]
+        # a plate without errors, laid down beside its place, each time a micrometre farther
+        mark = site + beside[:, None] + 1e-6 * len(views)
         true = target = sign * (mark if follow else site)
         for _ in range(20 * indicated):
             true = target - stage_error(*true, **stage)
