@@ -77,6 +77,7 @@ OLDEST_S = 10.0
 """Largest age of a detection for a valid stamp of exposure."""
 ALL_READ = ("detection clock", "rest", "ids", "marks", "check stops", "signs")
 COVERED = {
+    "publishers": (*ALL_READ, "theta"),
     "encoder rate": ("encoder clock", *ALL_READ),
     "encoder clock": ALL_READ,
     "commands": ALL_READ,
@@ -135,7 +136,8 @@ def grouped(
         covered = [
             item
             for item in failed
-            if item.name in COVERED.get(name, ()) and item.name != fault
+            if item.name in COVERED.get(name, ())
+            and (item.name != fault or name == "publishers")
         ]
         ordered += [replace(item, remedy="", follows=name) for item in covered]
         failed = [item for item in failed if item not in covered]
@@ -569,11 +571,15 @@ class CellCheck:
     def _tell(self, name: str, passed: bool, figure: str, remedy: str = "") -> None:
         self.items.append(CheckItem(name, passed, figure, "" if passed else remedy))
 
-    def _judge_publishers(self) -> bool:
-        """Tell whether one node publishes each of the cell's topics; return whether it is so."""
-        several = {
+    def _several(self) -> dict[str, list[str]]:
+        """Return the topics that several nodes publish on, and who."""
+        return {
             topic: nodes for topic, nodes in self.publishers.items() if len(nodes) > 1
         }
+
+    def _judge_publishers(self) -> bool:
+        """Tell whether one node publishes each of the cell's topics; return whether it is so."""
+        several = self._several()
         self._tell(
             "publishers",
             not several,
@@ -649,6 +655,8 @@ class CellCheck:
     ) -> None:
         rejected = measurements.all_rejected()
         total = len(self._seen)
+        if self._several():  # found, or begun, later than the others
+            self._judge_publishers()
         first = len(self.items)
         self._judge_stamps(progress, rejected)
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
