@@ -3,6 +3,7 @@
 
 import argparse
 import contextlib
+import re
 import sys
 import threading
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from selfcal_ros.cli.arguments import STDOUT
-from selfcal_ros.errors import ExitCode, InputError, visible
+from selfcal_ros.errors import ExitCode, InputError, printable, visible
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
@@ -20,6 +21,9 @@ from selfcal_ros.portable import fitted
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.settings.nodes import overrides_in
 from selfcal_ros.settings.parameter import TYPED, Settings
+
+NAMESPACE = re.compile(r"/?(?:[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*/?)?", re.ASCII)
+"""Namespaces of ROS, with or without the leading slash."""
 
 
 class Once(argparse.Action):
@@ -69,8 +73,29 @@ def add_fill(parser: argparse.ArgumentParser) -> None:
 def add_namespace(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--namespace`` of a cell that runs."""
     parser.add_argument(
-        "--namespace", metavar="NS", default="", help="namespace of the cell"
+        "--namespace",
+        metavar="NS",
+        type=_namespace,
+        default="",
+        help="namespace of the cell",
     )
+
+
+def _namespace(text: str) -> str:
+    """Return the namespace in an argument.
+
+    Raises
+    ------
+    InputError
+        If ROS has no such names.
+    """
+    if not NAMESPACE.fullmatch(text):
+        raise InputError(
+            "--namespace",
+            f"{printable(text)!r} is not a name of ROS",
+            "write letters, digits and _, no digit first, as in cell_1 or line/cell_1",
+        )
+    return text
 
 
 def add_recorded_namespace(parser: argparse.ArgumentParser) -> None:

@@ -336,6 +336,18 @@ def test_bad_input_is_one_line_before_anything_is_started(
     assert capsys.readouterr() == ("", f"{line}\n")
 
 
+@pytest.mark.parametrize("name", ["a b", "1x", "/a/2", "ä", "a//b"])
+@pytest.mark.parametrize(
+    "words", ["up --plan p.yaml", "monitor", "call start", "cell check --plan p.yaml"]
+)
+def test_a_namespace_that_ros_does_not_know_is_refused(capsys, words, name):
+    assert selfcal([*words.split(), "--namespace", name]) == 2
+    line = (
+        f"--namespace: {name!r} is not a name of ROS; write letters, digits and _, no"
+    )
+    assert line in capsys.readouterr().err
+
+
 class Child:
     def __init__(self, code: int | None) -> None:
         self.code, self.stderr = code, iter(())
