@@ -78,6 +78,7 @@ OLDEST_S = 10.0
 ALL_READ = ("detection clock", "rest", "ids", "marks", "check stops", "signs")
 COVERED = {
     "publishers": (*ALL_READ, "theta"),
+    "abort": ("commands", "detection clock"),
     "encoder rate": ("encoder clock", *ALL_READ),
     "encoder clock": ALL_READ,
     "commands": ALL_READ,
@@ -450,7 +451,7 @@ class CellCheck:
             "missing_m": [int(progress.readings.m[0])],
             "missing_n": [int(progress.readings.n[0])],
             "complete": False,
-            "grid_done": progress.grid_done - 1,
+            "grid_done": max(progress.grid_done - 1, 0),
         }
         while len(self._seen) == before and self._ports.now_s() < end:
             self._status(progress, mark)

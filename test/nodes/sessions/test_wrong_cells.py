@@ -90,6 +90,7 @@ class Cell(Bench):
 
     def see_again(self, fields):
         """Measure what a status names as missing."""
+        assert fields["grid_done"] >= 0  # it is unsigned in the message
         if not self.work and self.view is not None and not fields["complete"]:
             for m, n in zip(fields["missing_m"], fields["missing_n"], strict=True):
                 self.work += self.stops(self.view, m, n)
@@ -605,6 +606,11 @@ def test_two_publishers_are_the_only_fault():
     [item] = check.items
     assert (item.name, item.passed) == ("publishers", False)
     assert item.figure == "2 publishers of stage/mark_detections: camera, old_camera"
+
+
+def test_what_a_cell_that_goes_on_after_abort_still_shows_follows_from_that():
+    items = [CheckItem(name, False, name) for name in ("commands", "rest")]
+    assert [item.follows for item in grouped(items, "", ["abort"])] == ["abort", ""]
 
 
 def test_a_second_publisher_that_comes_later_is_the_first_fault():
