@@ -469,8 +469,9 @@ def _newest(folder: Path) -> tuple[int, Path | None]:
 
 
 def _files(bag: Path) -> list[Path]:
-    """Return the files of a journal in their order."""
-    return sorted(bag.glob(f"{bag.name}_*.mcap"), key=_number)
+    """Return the files of a journal in their order; a pipe would be waited for."""
+    files = bag.glob(f"{bag.name}_*.mcap")
+    return sorted((file for file in files if file.is_file()), key=_number)
 
 
 def _number(file: Path) -> tuple[int, str]:

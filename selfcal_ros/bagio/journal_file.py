@@ -109,12 +109,13 @@ def front() -> bytes:
 def is_of_another_recorder(path: Path) -> bool:
     """Return whether another recorder writes a file: its header is another, or still to come.
 
-    A file of a journal is never empty; what is damaged from its first bytes on may be one.
+    A file of a journal is never shorter than its magic; what is damaged from its first bytes on
+    may be one.
     """
     own = front()
     with path.open("rb") as file:
         beginning = file.read(len(own))
-    return not beginning or (
+    return len(beginning) < len(MAGIC) or (
         beginning.startswith(MAGIC) and not own.startswith(beginning)
     )
 

@@ -138,12 +138,13 @@ class BagReader:
         listed = self._files_of_metadata()
         # the files may have been renamed
         names = listed if present.intersection(listed) else recordings
-        instead = ", ".join(name for name in names if name not in listed)
+        instead = [name for name in names if name not in listed]
+        were = "were" if len(instead) > 1 else "was"
+        note = f"; {', '.join(instead)} {were} read" if instead else ""
         for name in listed:
             if name not in present:
                 self.lost.append(
-                    f"the file {name}, which metadata.yaml lists, is missing"
-                    + (f"; {instead} was read" if instead else "")
+                    f"the file {name}, which metadata.yaml lists, is missing{note}"
                 )
         plain = {name.removesuffix(".zstd") for name in names}
         for name in recordings:

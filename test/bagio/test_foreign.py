@@ -309,6 +309,9 @@ def test_files_that_were_renamed_are_read(tmp_path, events, expected):
     assert lost == [
         "the file a.mcap, which metadata.yaml lists, is missing; renamed.mcap was read"
     ]
+    Foreign().write(tmp_path / "bag" / "other.mcap", events)
+    _, [line, *_] = solved(tmp_path / "bag")
+    assert line.endswith("; other.mcap, renamed.mcap were read")
 
 
 def test_the_missing_files_of_a_bag_without_any_are_named(tmp_path):

@@ -334,7 +334,7 @@ def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
     assert {file: file.read_bytes() for file in (tmp_path / name).iterdir()} == before
 
 
-@pytest.mark.parametrize("begun", ["whole", "header", "empty"])
+@pytest.mark.parametrize("begun", ["whole", "header", "no magic", "empty"])
 def test_a_recording_with_the_name_of_a_journal_is_refused_as_it_is(tmp_path, begun):
     """`begun` is what a running recorder has written so far."""
     folder = tmp_path / "journal_20261127T102030Z"
@@ -346,7 +346,11 @@ def test_a_recording_with_the_name_of_a_journal_is_refused_as_it_is(tmp_path, be
         (folder / "metadata.yaml").unlink()
         os.truncate(
             file,
-            {"header": file.read_bytes().index(b"selfcal_ros") + 11, "empty": 0}[begun],
+            {
+                "header": file.read_bytes().index(b"selfcal_ros") + 11,
+                "no magic": 7,
+                "empty": 0,
+            }[begun],
         )
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(
@@ -355,6 +359,13 @@ def test_a_recording_with_the_name_of_a_journal_is_refused_as_it_is(tmp_path, be
     ):
         resume(tmp_path)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_pipe_is_no_file_of_a_journal(tmp_path):
+    folder = tmp_path / "journal_20261127T102030Z"
+    folder.mkdir()
+    os.mkfifo(folder / f"{folder.name}_0.mcap")
+    assert journal.newest(tmp_path) is None
 
 
 def test_a_journal_has_one_writer(tmp_path):
