@@ -25,6 +25,9 @@ LOOK_S = 0.1
 ALONE_S = 1.0
 """Time for which the publisher of a map must be alone before it is used: another one may be found
 later than a latched message."""
+FOUND_S = 4.0
+"""Time after which all publishers have been found by a node that begins: DDS repeats what it
+announces every 3 s, and may miss it before on a busy machine."""
 MOST_WAITING = 20
 """Messages of a topic that wait for that time; of more the oldest are refused."""
 KEPT = "maps from the network are not used until one node alone publishes them"
@@ -55,6 +58,7 @@ class MapsOfOneNode:
         ]
         self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque()
         self._rivals, self._rivals_s = "", 0.0  # last seen
+        self._found_s = time.monotonic() + FOUND_S
         self._subscriptions: list[Any] = []
         self._subscribe()
         node.own(self, MapsOfOneNode.close)
@@ -84,7 +88,7 @@ class MapsOfOneNode:
             self._waiting.remove(of_topic[0])
             raise InputError(
                 topic,
-                f"a message is not used: more than {MOST_WAITING} within {ALONE_S:g} s",
+                f"a message is not used: more than {MOST_WAITING} wait",
                 "publish each map once",
             )
 
@@ -110,7 +114,11 @@ class MapsOfOneNode:
     def _look(self) -> None:
         """Pass on what has waited, or begin anew once one publisher is left."""
         now_s = time.monotonic()
-        if self._has_rivals() or now_s - self._rivals_s < ALONE_S:
+        if (
+            self._has_rivals()
+            or now_s - self._rivals_s < ALONE_S
+            or now_s < self._found_s
+        ):
             return
         if self._rivals:
             self._rivals = ""

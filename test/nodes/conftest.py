@@ -68,9 +68,10 @@ def no_stale_segments():
 
 @pytest.fixture(autouse=not MISSING)
 def short_look(monkeypatch):
-    """Have players look for other publishers for a moment: the graph of a test has only its own."""
-    from selfcal_ros.nodes import player
+    """Look for other publishers for a moment only: the graph of a test has only its own."""
+    from selfcal_ros.nodes import compensator, player
 
+    monkeypatch.setattr(compensator, "FOUND_S", 0.05)
     monkeypatch.setattr(player, "LOOK_S", 0.05)
     monkeypatch.setattr(player, "FIRST_LOOK_S", 0.05)
 

@@ -5,6 +5,7 @@ import json
 import math
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -327,6 +328,16 @@ def test_of_two_nodes_that_were_there_before_no_map_is_used(graph):
     node = graph.node(CompensatorNode)
     graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
     assert node.session.compensator is None
+
+
+def test_a_node_that_begins_waits_until_others_have_been_found(graph, monkeypatch):
+    monkeypatch.setattr(compensator, "ALONE_S", 0.0)
+    monkeypatch.setattr(compensator, "FOUND_S", 0.5)
+    latch_map(graph)
+    begun_s = time.monotonic()
+    node = graph.node(CompensatorNode)
+    graph.until(lambda: node.session.compensator is not None, "the latched map")
+    assert time.monotonic() - begun_s >= 0.5
 
 
 def test_a_map_that_waits_when_a_second_node_is_found_is_counted(graph, monkeypatch):
