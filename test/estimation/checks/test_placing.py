@@ -164,7 +164,7 @@ def test_a_plate_that_was_not_moved_is_not_one_without_errors(planned, repeated)
 
 def test_a_view_that_was_not_placed_anew_is_named_among_others():
     readings, names = read("0, 90, tx", "0, 90, tx")
-    still = laid_once(readings, np.random.default_rng(6))
+    still = laid_once(readings, np.random.default_rng(6), again_m=5e-8)  # warmer
     views = (*readings.views[:2], still.views[2])
     found = misplaced(replace(readings, views=views))
     assert found is not None and found.view == names[2]
