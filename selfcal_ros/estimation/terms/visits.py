@@ -442,7 +442,9 @@ def without_noise(
 
     The offset that a microscope saw holds the noise of its reading. As a column it would explain
     just that noise, and nothing else where offsets hardly differ. What the estimate leaves of each
-    visit is taken off the offset: the rest owes nothing to the residuals.
+    visit is taken off the offset: the rest owes nothing to the residuals. Of a stage that follows
+    its marks residuals may be many times the offsets: all of them taken off, offsets would be the
+    residuals, and explain them.
 
     Parameters
     ----------
@@ -454,15 +456,21 @@ def without_noise(
         What terms make of each visit of each view, (V,), plate frame, m; none without terms.
     """
     visits = []
+    marks = inputs.z.reshape(-1) * inputs.half_width_m
     terms = of_terms or [0.0] * len(inputs.visits)
     for view, residual, of_model in zip(inputs.visits, residuals, terms, strict=True):
         if view is not None:
-            residuals_of_visits = view.about_means(
-                (view.y - of_model)[None], residual.size
-            )[0]
-            residuals_of_visits = residuals_of_visits + residual.reshape(-1)[view.mark]
-            view = replace(
-                view, offset=view.offset - residuals_of_visits * np.conj(view.phase)
+            within = view.about_means((view.y - of_model)[None], residual.size)[0]
+            means = residual.reshape(-1)[view.mark]
+            turned = (view.frame - 1) * marks[view.mark]
+            stood = (view.y - turned) * np.conj(view.phase) - view.offset
+            of_offsets, of_stops, of_means = (
+                float(np.sum(np.abs(values) ** 2))
+                for values in (view.offset, stood, means)
             )
+            # of a stage that follows its marks: offsets hold no more than they are
+            followed = of_offsets < min(of_stops, of_means)
+            noise = within + means * (of_offsets / of_means if followed else 1.0)
+            view = replace(view, offset=view.offset - noise * np.conj(view.phase))
         visits.append(view)
     return replace(inputs, visits=tuple(visits))
