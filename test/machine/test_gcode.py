@@ -255,10 +255,11 @@ def test_a_controller_whose_moves_count_from_another_zero_is_refused_and_not_mov
     assert len([line for line in firmware.lines if line.startswith("G1")]) == 1
 
 
-def test_a_linuxcnc_in_inches_tells_where_it_is():
+@pytest.mark.parametrize(("unit", "per_mm"), [("INCH", 1 / 25.4), ("CM", 0.1)])
+def test_a_linuxcnc_in_another_unit_tells_where_it_is(unit, per_mm):
     """Its numbers are in the unit of its INI file; taken for mm the first small move is long."""
     firmware = LinuxCnc()
-    firmware.unit, firmware.per_mm = "INCH", 1 / 25.4
+    firmware.unit, firmware.per_mm = unit, per_mm
     firmware.at |= {"X": 100.0, "A": 90.0}
     with over_tcp(firmware) as port:
         machine = GcodeMachine(port, "linuxcnc", feed=6000.0, axes=["x", "y", "theta"])
