@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
+from selfcal_ros.bagio.exposure_table import read_positions
+from selfcal_ros.bagio.images import ImageBag, encoder_track
 from selfcal_ros.cli.terminal import add_json, say, warn
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml

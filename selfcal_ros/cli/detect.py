@@ -8,7 +8,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
+from selfcal_ros.bagio.exposure_table import read_positions, write_pictures
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import (
     add_json,

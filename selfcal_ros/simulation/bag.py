@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros import topics
-from selfcal_ros.bagio.images import COLUMNS
+from selfcal_ros.bagio.exposure_table import COLUMNS
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.writer import BagWriter, new_bag
