@@ -798,7 +798,7 @@ def _beside_map(
     if system.grid.n_sites > MAX_FULL:
         return {}
     plates = cover.cover.maps_of_terms()[1].T
-    lines = np.zeros((len(plates), 2, 0))
+    lines = np.zeros((len(plates), 2, system.angular.n_lines))
     if system.angular.n_views:
         stage, of_plate = cover.terms
         of_plate = of_plate + stage[system.known_lines].mean(axis=0)

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The factors of a covariance that a result keeps: how large a field, which way round."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.datum.covariance import LinesCovariance, MapsCovariance
 from selfcal_ros.estimation.joint.solve import saved_terms, solve_joint
 from selfcal_ros.estimation.options import Options
@@ -14,6 +17,8 @@ from selfcal_ros.estimation.terms.equations import roots_by_term
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense, lines_turned_over
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.truth import hu_plan, simulate_measurements
@@ -111,3 +116,25 @@ def test_what_terms_and_noise_are_in_u_of_the_angular_map_adds_up(sense, datum):
     assert solved.result.error_map.u_g_theta**2 == pytest.approx(
         of_terms + lines_turned_over(sense, of_noise, sign=1), rel=1e-5
     )
+
+
+def test_a_result_without_its_lines_is_read_again():
+    """Of a plate with lines, none of which was read."""
+    rng = np.random.default_rng(1)
+    plan = hu_plan(Artifact(5, 0.01, 8), 2)
+    plan = replace(
+        plan,
+        views=tuple(replace(view, angular=False) for view in plan.views if view.grid),
+    )
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    readings = simulate_measurements(truth, plan, rng, sigma_m=2e-8, visits=True)
+    result = calibrate(readings, Options())
+    again = result_from_dict(result_to_dict(worded(result)), "R.json")
+    known_sites = result.error_map.valid
+    np.testing.assert_allclose(
+        covariance_of(again, "xy", known_sites),
+        covariance_of(result, "xy", known_sites),
+        rtol=1e-5,
+        atol=1e-24,
+    )
+    assert again.kept.factors.beside["lines"].shape[1:] == (2, 8)
