@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image files with a table of positions as a bag."""
+"""Tables of exposures as a bag: of image files with positions, or of readings."""
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -14,11 +14,11 @@ import numpy as np
 
 from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.writer import BagWriter, new_bag
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError, NoDataError, known_are
 from selfcal_ros.files import csv_rows, read_bytes, read_text
 from selfcal_ros.model.view import Plan
-from selfcal_ros.plain_numbers import number_of
+from selfcal_ros.plain_numbers import number_of, whole_number_of
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,
@@ -31,6 +31,20 @@ from selfcal_ros.units import NS_PER_S
 COLUMNS = ("file", "view", "x", "y")
 """Columns of a table of positions: image file, name of the view, indicated position, m. Without a
 plan the view is not needed."""
+READING_COLUMNS = ("view", "x", "y")
+"""Columns of a table of readings: name of the view, indicated position, m."""
+OF_READING = (
+    "m",
+    "n",
+    "offset_x",
+    "offset_y",
+    "theta",
+    "k",
+    "offset_theta",
+    "sigma",
+)
+"""Further columns of a table of readings, as in selfcal_msgs/MarkDetection (m, rad), and the
+indicated angle; of a line k is given, of a mark it is empty."""
 TIME = "time"
 """Column for the times of the exposures, if they are known: ISO 8601 with its zone."""
 EARLIEST, LATEST = (
@@ -52,14 +66,20 @@ BESIDE_NS = (-20_000_000, -10_000_000, 10_000_000, 20_000_000)
 
 @dataclass(frozen=True)
 class Position:
-    """A row: place for messages, image file, index of the view, position in m, time if known."""
+    """A row: place for messages, its cells, index of the view, position (m, rad), time if known."""
 
     where: str
-    file: str
+    cells: Mapping[str, str]
     view: int
     x_m: float
     y_m: float
+    theta_rad: float = 0.0
     stamp_ns: int | None = None
+
+    @property
+    def file(self) -> str:
+        """The image file."""
+        return self.cells["file"]
 
 
 def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
@@ -74,24 +94,55 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     NoDataError
         If there are no rows.
     """
+    rows = _rows(path, plan, COLUMNS)
+    first: dict[str, str] = {}
+    for row in rows:
+        if first.setdefault(row.file, row.where) != row.where:
+            raise InputError(
+                row.where,
+                f"{row.file} is in line {first[row.file].rpartition(':')[2]} as well",
+                "give each image once; a repeated mark is another image",
+            )
+    return rows
+
+
+def read_readings(path: str | Path, plan: Plan) -> list[Position]:
+    """Return the rows of a table of readings, by view, in the order of the table.
+
+    Raises
+    ------
+    InputError, NoDataError
+        As `read_positions`, and for a column that is unknown, or a plan whose images show several
+        marks.
+    """
+    if any(view.image for view in plan.views):
+        raise InputError(
+            str(path),
+            "a table of readings has one mark in each exposure, the images of the plan more",
+            "leave image out of the plan",
+        )
+    return _rows(path, plan, READING_COLUMNS, further=OF_READING)
+
+
+def _rows(
+    path: str | Path,
+    plan: Plan | None,
+    needed: Sequence[str],
+    *,
+    further: Sequence[str] | None = None,
+) -> list[Position]:
+    """Return the rows of a table, by view; `further`: the only other columns that it may have."""
     lines = csv_rows(read_text(path), str(path))
     heading = lines[0][1] if lines else []
-    columns = [column for column in COLUMNS if plan or column != "view"]
+    columns = [column for column in needed if plan or column != "view"]
     columns += [TIME] if TIME in heading else []
-    for column in columns:
-        if column not in heading:
-            raise InputError(
-                str(path),
-                f"no column '{column}'",
-                f"begin with the line {','.join(columns)}",
-            )
+    _check_heading(heading, str(path), columns, further)
     if len(lines) == 1:
         raise NoDataError(
-            str(path), "no row below the heading", "give one for each image"
+            str(path), "no row below the heading", "give one for each exposure"
         )
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
-    first: dict[str, str] = {}
     for where, texts in lines[1:]:
         cells = dict(zip(heading, texts, strict=False))
         if not all(cells.get(column) for column in columns):
@@ -101,19 +152,14 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
             raise InputError(
                 where, f"the plan has no view '{view}'", known_are(view, names)
             )
-        if first.setdefault(cells["file"], where) != where:
-            raise InputError(
-                where,
-                f"{cells['file']} is in line {first[cells['file']].rpartition(':')[2]} as well",
-                "give each image once; a repeated mark is another image",
-            )
         rows.append(
             Position(
                 where=where,
-                file=cells["file"],
+                cells=cells,
                 view=names.index(view),
                 x_m=_metres(cells["x"], where),
                 y_m=_metres(cells["y"], where),
+                theta_rad=_number(cells, "theta", where) if further else 0.0,
                 stamp_ns=_stamp_ns(cells[TIME], where) if TIME in heading else None,
             )
         )
@@ -127,11 +173,37 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
         ):
             raise InputError(
                 row.where,
-                f"not exposed 0.1 s or more after {before.file}",
+                f"not exposed 0.1 s or more after line {before.where.rpartition(':')[2]}",
                 "give the times in the order of the exposures, and the views of the "
                 "plan in the order in which they were measured; or omit the column",
             )
     return rows
+
+
+def _check_heading(
+    heading: Sequence[str],
+    path: str,
+    columns: Sequence[str],
+    further: Sequence[str] | None,
+) -> None:
+    """Refuse a heading that lacks a column, or has one that is unknown."""
+    for column in columns:
+        if column not in heading:
+            raise InputError(
+                path,
+                f"no column '{column}'",
+                f"begin with the line {','.join(columns)}",
+            )
+    if further is None:
+        return
+    known_columns = list(dict.fromkeys([*columns, *further, TIME]))
+    for column in heading:
+        if heading.count(column) > 1:
+            raise InputError(path, f"two columns '{column}'", "leave one out")
+        if column not in known_columns:
+            raise InputError(
+                path, f"no column is named '{column}'", known_are(column, known_columns)
+            )
 
 
 def _stamp_ns(text: str, where: str) -> int:
@@ -182,6 +254,84 @@ def _metres(text: str, where: str) -> float:
     return value
 
 
+def _number(cells: Mapping[str, str], column: str, where: str) -> float:
+    """Return the number in a column that may be missing, or empty: 0."""
+    text = cells.get(column) or "0"
+    try:
+        value = number_of(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(where, f"{column}: '{text}' is not a number", "give m and rad")
+    return value
+
+
+def _index(cells: Mapping[str, str], column: str, where: str) -> int | None:
+    """Return the whole number in a column; None if it is missing, or empty."""
+    text = cells.get(column)
+    if not text:
+        return None
+    try:
+        return whole_number_of(text)
+    except ValueError:
+        raise InputError(
+            where,
+            f"{column}: '{text}' is not a whole number",
+            "give the id of the mark",
+        ) from None
+
+
+def _reading(row: Position, stamp_ns: int) -> Detection:
+    """Return the detection of a mark, with its id (m, n) or without, or of a line."""
+    m, n, k = (_index(row.cells, column, row.where) for column in ("m", "n", "k"))
+    if (m is None) != (n is None) or (m is not None and k is not None):
+        raise InputError(
+            row.where,
+            "neither a mark nor a line",
+            "give m and n of a mark, or neither, or k of a line",
+        )
+    numbers = {
+        column: _number(row.cells, column, row.where)
+        for column in ("offset_x", "offset_y", "offset_theta", "sigma")
+    }
+    return Detection(
+        stamp_ns=stamp_ns,
+        kind=Kind.GRID if k is None else Kind.ANGULAR,
+        has_id=m is not None or k is not None,
+        m=m or 0,
+        n=n or 0,
+        k=k or 0,
+        **numbers,
+        score=1.0,
+    )
+
+
+def write_readings(
+    rows: Sequence[Position], plan: Plan, output: str | Path, *, frame_id: str
+) -> None:
+    """Write a bag of the commands of a plan and the readings of a table.
+
+    Parameters
+    ----------
+    rows : sequence of Position
+        The exposures, one or more, by view.
+    plan : Plan
+        The plan.
+    output : str or Path
+        Bag folder to create.
+    frame_id : str
+        Frame of the detections.
+
+    Raises
+    ------
+    InputError
+        If a cell is none of its column, or a row is neither of a mark nor of a line.
+    """
+    _write(
+        rows, plan, output, lambda row, stamp_ns: [_reading(row, stamp_ns)], frame_id
+    )
+
+
 def write_pictures(
     folder: Path,
     rows: Sequence[Position],
@@ -223,23 +373,38 @@ def write_pictures(
     """
     _require_files(folder, rows)
     problems: Counter[str] = Counter()
+
+    def detected(row: Position, stamp_ns: int) -> Iterable[Detection]:
+        try:
+            return detect(read_bytes(folder / row.file), row.file, stamp_ns)
+        except InputError as error:
+            problems[str(error)] += 1
+            return ()
+
+    _write(rows, plan, output, detected, frame_id, check)
+    return problems
+
+
+def _write(
+    rows: Sequence[Position],
+    plan: Plan,
+    output: str | Path,
+    detect: Callable[[Position, int], Iterable[Detection]],
+    frame_id: str,
+    check: Callable[[], None] = lambda: None,
+) -> None:
+    """Write a bag of the commands, the positions, and the detections of each exposure."""
     first_ns = rows[0].stamp_ns
     run_id = str(START_NS if first_ns is None else first_ns - STEP_NS)
     with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
-        bag = _PictureBag(writer, plan, frame_id, run_id)
+        bag = _ExposureBag(writer, plan, frame_id, run_id)
         for row, commands, exposed_ns in _timed(rows):
             for phase, commanded_ns in commands.items():
                 bag.command(phase, row.view, commanded_ns)
             bag.position(row, exposed_ns)
-            try:
-                detections = detect(read_bytes(folder / row.file), row.file, exposed_ns)
-            except InputError as error:
-                problems[str(error)] += 1
-            else:
-                bag.detections(detections, exposed_ns)
+            bag.detections(detect(row, exposed_ns), exposed_ns)
         bag.command(Phase.DONE, len(plan.views), exposed_ns + STEP_NS)
         check()
-    return problems
 
 
 def _require_files(folder: Path, rows: Sequence[Position]) -> None:
@@ -273,8 +438,8 @@ def _timed(
             yield row, commands, row.stamp_ns
 
 
-class _PictureBag:
-    """Writes what a cell would have published while it took the images."""
+class _ExposureBag:
+    """Writes what a cell would have published during the exposures."""
 
     def __init__(
         self, writer: BagWriter, plan: Plan, frame_id: str, run_id: str
@@ -310,7 +475,9 @@ class _PictureBag:
         """Write the position of a stage at rest."""
         for step_ns in BESIDE_NS:
             sample = EncoderSample(
-                stamp_ns + step_ns, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0)
+                stamp_ns + step_ns,
+                ("x", "y", "theta"),
+                (row.x_m, row.y_m, row.theta_rad),
             )
             message = from_model.joint_state(sample, self._frame_id)
             self._writer.write(f"/{ENCODER_TOPIC}", message, stamp_ns + step_ns)

@@ -58,6 +58,7 @@ WANTED = {
     "MAP.csv": TABLE,
     "DATA.csv": TABLE,
     "FILE.csv": TABLE,
+    "READINGS.csv": TABLE,
     "IN": PROGRAM,
 }
 """Name of an argument -> kind of file that it stands for."""
@@ -69,8 +70,8 @@ USES = {
     CELL: "`selfcal cell try {}` shows what its machine sees",
     PARAMETERS: "give it with --params",
     CAL: "`selfcal cal check {}` reads it",
-    TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points; readings have to be in a "
-    "bag (docs/reference/bags.md)",
+    TABLE: "`selfcal apply RESULT.json {0} -o OUT.csv` corrects points; "
+    "`selfcal detect {0} --plan PLAN.yaml -o BAG` makes a bag of readings",
     PROGRAM: "`selfcal gcode {} RESULT.json -o OUT` corrects it",
 }
 """Kind of file -> what it is good for, with its name."""

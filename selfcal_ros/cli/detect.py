@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal detect``: marks in the images of a bag, written as detections."""
+"""``selfcal detect``: marks in the images of a bag, or in a table, written as detections."""
 
 import argparse
 from collections import Counter
@@ -8,7 +8,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from selfcal_ros.bagio.exposure_table import read_positions, write_pictures
+from selfcal_ros.bagio.exposure_table import (
+    read_positions,
+    read_readings,
+    write_pictures,
+    write_readings,
+)
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import (
@@ -21,6 +26,7 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
+from selfcal_ros.model.view import Plan
 from selfcal_ros.outputs import creating, write_bytes
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
@@ -40,9 +46,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument(
         "bag",
-        metavar="BAG",
+        metavar="BAG|READINGS.csv",
         help="bag with stage/image or "
-        "stage/image/compressed; with --positions the folder of image files",
+        "stage/image/compressed; with --positions the folder of image files; or a table of "
+        "readings (docs/start/readings.md)",
     )
     parser.add_argument(
         "--positions",
@@ -52,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan",
         metavar="PLAN.yaml",
-        help="plan with plate and views, needed with --positions",
+        help="plan with plate and views, needed with --positions and for a table of readings",
     )
     parser.add_argument(
         "-o",
@@ -83,6 +90,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
+    if args.bag.lower().endswith(".csv"):
+        return _from_table(args)
     settings = replace(
         node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)),
         max_marks=ANY_NUMBER,
@@ -116,13 +125,42 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _from_table(args: argparse.Namespace) -> int:
+    """Write a bag from a table of readings."""
+    of_images = {
+        "--positions": args.positions,
+        "--draw": args.draw,
+        "--params": args.params,
+        "--namespace": args.namespace,
+        **{f"--{option}": getattr(args, option) for option in WITH_IDS},
+    }
+    for option, value in of_images.items():
+        if value is not None:
+            raise InputError(
+                option.replace("_", "-"),
+                f"is of images, and {args.bag} is a table of readings",
+                "leave it out",
+            )
+    plan = _plan(args, args.bag)
+    rows = read_readings(args.bag, plan)
+    write_readings(rows, plan, args.output, frame_id=DetectorSettings().frame_id)
+    text = f"{args.output}: {counted(len(rows), 'reading')}"
+    say(args, text, {"bag": args.output, "readings": len(rows)})
+    return 0
+
+
+def _plan(args: argparse.Namespace, of_what: str) -> Plan:
+    """Return the plan behind a table."""
+    if not args.plan:
+        raise InputError(of_what, "the plan is missing", "give --plan PLAN.yaml")
+    return read_plan(args.plan)
+
+
 def _from_files(
     args: argparse.Namespace, detector: ImageDetector, settings: DetectorSettings
 ) -> Counter[str]:
     """Write a bag from image files and a table of positions; return problems."""
-    if not args.plan:
-        raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
-    plan = read_plan(args.plan)
+    plan = _plan(args, "--positions")
     settings.require_plate(plan.artifact, args.params or TYPED)
     return write_pictures(
         Path(args.bag),

@@ -52,7 +52,9 @@ VERBS = {
         MEASURE, "try a machine, or check a cell before its first calibration"
     ),
     "camera": Verb(MEASURE, "find the pixel size, rotation and mirroring of a camera"),
-    "detect": Verb(MEASURE, "find the marks in the images of a bag"),
+    "detect": Verb(
+        MEASURE, "find the marks in the images of a bag, or take a table of readings"
+    ),
     "solve": Verb(MEASURE, "calibrate from a bag: MCAP file or rosbag2 folder"),
     "replay": Verb(
         MEASURE, "play a bag into the live nodes and take the map from them"

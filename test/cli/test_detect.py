@@ -433,7 +433,7 @@ def own_values(data):
         (
             "file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:01Z\n"
             "b.png,shift,0,0,2026-11-21T10:30:01.05+01:00\n",
-            ":3: not exposed 0.1 s or more after a.png; give the times in the order "
+            ":3: not exposed 0.1 s or more after line 2; give the times in the order "
             "of the exposures",
         ),
         (
@@ -476,7 +476,7 @@ def test_a_table_without_rows_is_no_data(tmp_path, capsys):
         == 4
     )
     assert (
-        "p.csv: no row below the heading; give one for each image"
+        "p.csv: no row below the heading; give one for each exposure"
         in capsys.readouterr().err
     )
     assert not (tmp_path / "found").exists()
