@@ -775,7 +775,7 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     if known_sites.sum() < 3:
         raise InputError(
             members[-1].name,
-            f"{int(known_sites.sum())} sites are known with their uncertainty in all maps",
+            "fewer than three sites are known with their uncertainty in all maps",
             "combine maps that overlap",
         )
     require_own_readings(members, common, scale=not keep_scale)

@@ -321,7 +321,7 @@ def compare(
     if n_known < 3:
         raise InputError(
             names[1],
-            f"{n_known} sites are known in both maps",
+            "fewer than three sites are known in both maps",
             "compare maps that overlap",
         )
 

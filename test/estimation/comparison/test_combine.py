@@ -848,7 +848,7 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
                     ),
                 ),
             ],
-            "0 sites are known",
+            "fewer than three sites are known",
         ),
     ],
 )
