@@ -15,8 +15,9 @@ compared, of fewer views those of the cells beside it as well, each cell as a vi
 were named.
 
 A plate that was not moved between two views gives every site the same reading in both: that agrees
-with a plate without errors, and the map is that of stage and plate together. No placing repeats
-within `PLACED_AGAIN_M`.
+with a plate without errors, and the map is that of stage and plate together. It is told from such a
+plate by its motion, within `PLACED_AGAIN_M`, where plates are compared to `SAME_NOISE_M`: a plate
+with errors below that, placed again within that motion, is taken for it.
 """
 
 from collections.abc import Callable, Iterator
@@ -59,8 +60,13 @@ STEPS = (-2, -1, 1, 2)
 """Steps along a row of marks by which a plate is tried beside its place."""
 SAME_MARK = 0.1
 """Distance, in pitches, within which a mark at another pose lies on a mark of a list."""
-PLACED_AGAIN_M = 1e-7
-"""Motion between two views, m, below which the plate was not placed anew: no placing repeats so."""
+PLACED_AGAIN_M, SAME_NOISE_M = 1e-7, 5e-8
+"""Motion between two views, m, below which the plate was hardly placed anew, and the largest noise
+of the means, m, with which this is asked."""
+NOISE_ALONE = 1.5
+"""Mean square of differences, over that of the noise, above which the plate has errors."""
+SAME_DEG, SAME_PITCHES = 1e-3, 1e-3
+"""Turn, and shift, within which the plan places the plate as before."""
 ON_MARKS = 0.8
 """Part of the readings of a view that another pose must have on marks."""
 
@@ -206,11 +212,18 @@ def _unmoved(
         for earlier_view, earlier in compared_views[:later]:
             if (
                 view.cell == earlier_view.cell
-                and readings.pose != earlier.pose
+                and not _placed_alike(readings.pose, earlier.pose)
                 and _lies_as_before(measurements, earlier, readings)
             ):
                 return Misplaced.of(view.plan_view, readings.pose, earlier.pose)
     return None
+
+
+def _placed_alike(pose: StagePose, other: StagePose) -> bool:
+    """Return whether the plan places the plate as before, also where lines are read once."""
+    turned_deg = (pose.turn_deg - other.turn_deg + 180) % 360 - 180
+    shifted = np.subtract(pose.shift, other.shift)
+    return bool(abs(turned_deg) < SAME_DEG and np.abs(shifted).max() < SAME_PITCHES)
 
 
 def _lies_as_before(
@@ -223,10 +236,6 @@ def _lies_as_before(
     _, first, second = np.intersect1d(earlier_site, later_site, return_indices=True)
     if len(first) < LEAST_READINGS:
         return False
-    noise, spread = _sizes(measurements, [earlier, later])
-    noise = max(noise, LEAST_NOISE_M)
-    if not spread > 2 * noise:
-        return False
     moved = later.deviation[second] - earlier.deviation[first]
     z = later.place[second] / WINDOW
     columns = np.stack([np.ones(len(z)), 1j * z], axis=1)
@@ -234,8 +243,15 @@ def _lies_as_before(
     residuals = moved - columns @ lies
     scatter = np.sqrt(np.sum(np.abs(residuals) ** 2) / (4 * (len(z) - 2)))
     motion = np.sqrt(np.mean(np.abs(columns @ lies) ** 2))
+    noise, spread = _sizes(measurements, [earlier, later])
+    if not any(view.dof_xy for view in measurements.views):
+        noise = scatter  # which nothing else tells
+    noise = max(noise, LEAST_NOISE_M)
     return bool(
-        scatter**2 < CONTRADICTED * noise**2 and motion < max(PLACED_AGAIN_M, scatter)
+        noise < SAME_NOISE_M
+        and spread > 2 * noise
+        and scatter**2 < NOISE_ALONE * noise**2
+        and motion < PLACED_AGAIN_M
     )
 
 

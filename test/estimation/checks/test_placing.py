@@ -10,10 +10,17 @@ import pytest
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
+from selfcal_ros.estimation.checks.placing import (
+    PlacingError,
+    _placed_alike,
+    misplaced,
+    other_poses,
+)
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import PlacedPose
 from selfcal_ros.model.readings import Sense, subset
+from selfcal_ros.simulation.machine import Spread
 from test.support import placed
 from test.support.collecting import collect, gathered, scene
 from test.support.mark_lists import lattice, rings, scatter
@@ -178,6 +185,31 @@ def test_a_plate_without_errors_is_not_one_that_was_not_moved():
     truth = replace(truth, a=0.0 * truth.a)
     plan = plan_of("0, 90, tx", 7, count=0, repeats=2)
     assert misplaced(simulate_measurements(truth, plan, rng, sigma_m=2e-8)) is None
+
+
+@pytest.mark.parametrize(
+    ("plate_m", "noise_m", "placing_m"), [(5e-8, 1e-7, 3e-8), (2e-8, 2e-8, 2e-8)]
+)
+def test_a_good_plate_that_is_placed_again_exactly_is_not_one_that_was_not_moved(
+    plate_m, noise_m, placing_m
+):
+    """Against pins, or aligned by its marks: where the readings show the errors of its marks."""
+    spread = Spread(g_m=1e-6, a_m=plate_m, phi_rad=5e-7, t_m=placing_m)
+    plan = plan_of("0, 90, tx, ty", 11, count=0, repeats=5)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = random_truth(plan.artifact, 4, rng, spread)
+        readings = simulate_measurements(truth, plan, rng, sigma_m=noise_m)
+        assert misplaced(readings) is None
+
+
+def test_a_pose_that_comes_twice_is_none_that_was_not_moved():
+    """Off the lattice, with lines in one of its views."""
+    pose = PlacedPose(np.exp(0.3j), (0.5, 0.25), 3.0)
+    assert _placed_alike(pose, replace(pose, turn_lines=None))
+    assert _placed_alike(pose, replace(pose, phase=np.exp((0.3 + 2e-6) * 1j)))
+    assert not _placed_alike(pose, replace(pose, phase=np.exp(0.301j)))
+    assert not _placed_alike(pose, replace(pose, shift=(0.5, 0.26)))
 
 
 def unrepeated(readings):
