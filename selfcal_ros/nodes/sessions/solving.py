@@ -463,22 +463,23 @@ class SolvingSession:
 
     def _save_by_itself(self) -> None:
         """Write the results that are not written, each to the file of its run."""
+        problem = ""
         for path, result in [*self._unwritten.items()]:
             try:
                 write_json(path, results.result_to_dict(results.created_now(result)))
             except InputError as error:
                 # the map itself is good, and save_map may use another path
                 self._tried_s = self._ports.now_s()
-                if not self._unsaved:
+                if not (self._unsaved or problem):
                     self._ports.say(Level.ERROR, f"save_path: {error}")
-                self._unsaved = f"the map is not saved: {error}"
-                return
+                problem = f"the map is not saved: {error}"
+                continue
             del self._unwritten[path]
             if result is self.shown.result:
                 self._saved = str(path)
             if self._unsaved:
                 self._ports.say(Level.OK, f"the map is saved now: {path}")
-        self._unsaved = ""
+        self._unsaved = problem
 
     def save_again(self) -> None:
         """Write results that could not be written, some time after the last attempt."""

@@ -613,6 +613,26 @@ def test_a_map_that_waits_for_space_is_written_though_the_next_run_has_none(tmp_
     assert "not saved" not in told.message and told.values["saved"] == ""
 
 
+def test_a_map_that_cannot_be_written_keeps_no_other_from_its_file(tmp_path):
+    """A folder has the name of the first run's file."""
+    runs = [str(START_NS), str(START_NS + 1)]
+    first, second = (tmp_path / f"map_{run}.json" for run in runs)
+    first.mkdir()
+    desk = Desk(
+        save_path=str(tmp_path / "map_{run_id}.json"), result_folder=str(tmp_path)
+    )
+    desk.take(views_of(run_id=runs[0]))
+    desk.session.take_command(command(1, run_id=runs[1]))
+    desk.take(views_of(run_id=runs[1]))
+    assert json.loads(second.read_text())["run_id"] == runs[1]
+    assert "the map is not saved" in desk.session.diagnosis().message
+    first.rmdir()
+    desk.hands.pass_time(RETRY_S)
+    desk.session.save_again()
+    assert json.loads(first.read_text())["run_id"] == runs[0]
+    assert "not saved" not in desk.session.diagnosis().message
+
+
 def test_only_regular_files_are_loaded(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, problem in (
