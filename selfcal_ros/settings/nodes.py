@@ -10,7 +10,7 @@ from typing import Any, ClassVar, get_args
 
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.compensation.cells import Interpolation, Outside
-from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.errors import InputError, did_you_mean, known_are
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceKind
@@ -718,16 +718,27 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
 
 
 def check_parameters(data: object, where: str) -> None:
-    """Refuse a parsed ROS parameter file with a node, a name or a value that no node takes.
+    """Refuse a parsed ROS parameter file with a misspelt node or name, or a value of another kind.
 
-    Each section is checked by itself: those of several cells may differ.
+    Each section is checked by itself: those of several cells may differ. Nodes of other packages
+    may be in the file, and their parameters in a section of all nodes.
 
     Raises
     ------
     InputError
         For the first of them.
     """
+    of_any_node = {p.name for table in NODE_PARAMETERS.values() for p in table}
     for name, section in _sections(data, "", where):
+        last = name.rsplit("/", 1)[-1]
+        if last in ("**", "*"):
+            for key in section:
+                hint = did_you_mean(str(key), of_any_node)
+                if key not in of_any_node and hint:
+                    raise InputError(f"{where}: {key}", "no node has it", hint)
+            section = {key: section[key] for key in section if key in of_any_node}
+        elif last not in NODE_PARAMETERS and not did_you_mean(last, NODE_PARAMETERS):
+            continue
         alone = {name: {"ros__parameters": section}}
         for node, kind in NODE_SETTINGS.items():
             kind.checked(overrides_in(alone, node, where), where)

@@ -403,6 +403,15 @@ def test_sections_of_two_cells_may_differ():
     check_parameters({"/a/solver": section, "/b/solver": other}, "p.yaml")
 
 
+def test_a_file_may_hold_parameters_of_other_packages():
+    camera = {"ros__parameters": {"exposure": 0.01}}
+    everywhere = {"ros__parameters": {"exposure": 0.01, "robust": True}}
+    check_parameters({"/camera": camera, "/**": everywhere}, "p.yaml")
+    everywhere["ros__parameters"]["robsut"] = True
+    with pytest.raises(InputError, match="did you mean 'robust'"):
+        check_parameters({"/**": everywhere}, "p.yaml")
+
+
 @pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90, tx", 2)])
 def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
     monkeypatch, tmp_path, capsys, plan, code
