@@ -4,7 +4,7 @@
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 from math import degrees, isfinite, nan
 from typing import Any
 
@@ -61,8 +61,11 @@ TURNED_DEG = 5.0
 CLEARLY, LEAST_TURN_RAD = 0.25, 2e-4
 """Part of the plate's turn within which lines show it or its opposite, and the least turn for which
 this is not chance."""
-PLACED, PLACED_DEG = 0.1, 0.5
-"""Part of the pitch, and turn, by which the plate may lie beside where it is placed."""
+AT_ONCE = 0.25
+"""Part of the time between two marks within which a detection comes again at once."""
+PLACED = 0.4
+"""Part of the pitch by which the plate may lie beside where it is placed: from half of it on, marks
+without ids are taken for their neighbours."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 MOST_NAMED = 5
@@ -776,14 +779,27 @@ class CellCheck:
         )
 
     def _come_twice(self) -> bool:
-        """Whether most marks have several offsets, each of them twice: under another stamp."""
-        offsets: dict[tuple[int, int], Counter] = {}
-        for seen in self._detections:
-            if seen.kind == Kind.GRID and seen.has_id:
-                mark = offsets.setdefault((seen.m, seen.n), Counter())
-                mark[seen.offset_x, seen.offset_y] += 1
-        twice = [len(seen) > 1 and min(seen.values()) > 1 for seen in offsets.values()]
-        return 2 * sum(twice) > len(twice)
+        """Whether most detections come again at once, under another stamp.
+
+        A detector that rounds may give one offset at two exposures, whose stamps are apart.
+        """
+        marks = sorted(
+            (
+                seen
+                for seen in self._detections
+                if seen.kind == Kind.GRID and seen.has_id
+            ),
+            key=lambda seen: seen.stamp_ns,
+        )
+        of_pairs: dict[bool, list[int]] = {True: [], False: []}
+        for seen, then in pairwise(marks):
+            is_same = replace(then, stamp_ns=seen.stamp_ns) == seen
+            of_pairs[is_same].append(then.stamp_ns - seen.stamp_ns)
+        again_ns, between_ns = of_pairs[True], of_pairs[False]
+        return bool(between_ns) and (
+            3 * len(again_ns) > len(marks)
+            and float(np.median(again_ns)) < AT_ONCE * float(np.median(between_ns))
+        )
 
     def _turn_rad(self, view: ViewReadings) -> float:
         """Return the turn of the plate by its marks."""
@@ -797,14 +813,15 @@ class CellCheck:
         shift_m = float(np.mean(view.dx)), float(np.mean(view.dy))
         turn_deg = degrees(self._turn_rad(view))
         limit_m = PLACED * self.plate.grid_pitch_m
-        if max(map(abs, shift_m)) > limit_m or abs(turn_deg) > PLACED_DEG:
+        limit_deg = degrees(self._settings.max_rotation)
+        if max(map(abs, shift_m)) > limit_m or abs(turn_deg) > limit_deg:
             x_mm, y_mm = (part * MM_PER_M for part in shift_m)
             self._tell(
                 "placing",
                 False,
                 f"the plate lies ({x_mm:+.3g}, {y_mm:+.3g}) mm and {turn_deg:+.2g}° from where "
                 "the view places it",
-                f"place it within {limit_m * MM_PER_M:.3g} mm and {PLACED_DEG:g}°, or set the "
+                f"place it within {limit_m * MM_PER_M:.3g} mm and {limit_deg:.2g}°, or set the "
                 "zeros of the encoders",
             )
         x, y = (
@@ -860,7 +877,7 @@ class CellCheck:
                 "lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
                 "by 1 mrad and check again"
             )
-            if degrees(enough_rad) < PLACED_DEG:
+            if enough_rad < self._settings.max_rotation / 2:
                 remedy += f"; or turn it by {enough_rad * MRAD_PER_RAD:.2g} mrad"
             figure += (
                 ""
@@ -955,10 +972,15 @@ def _fault_of_offsets(
             wrong and (mirrored or abs(turned) > 180 - TURNED_DEG)
         ):
             how = f"turned by {turned:+.1f}° against the stage"
+            stated = (
+                f"mirror: true, turn: {turned:.1f}"
+                if mirrored
+                else f"turn: {-turned:.1f}"
+            )
             return Fault(
                 f"the offsets are {'mirrored (x) and ' * mirrored}{how}",
-                f"publish offsets along the stage's axes: {'mirror and ' * mirrored}turn the "
-                f"camera back by this angle, or state it (detector: {'mirror, ' * mirrored}turn)",
+                f"publish offsets along the stage's axes (mark_detector, if it states neither "
+                f"turn nor mirror: {stated})",
             )
     if wrong:
         return Fault(

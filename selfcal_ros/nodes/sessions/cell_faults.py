@@ -4,6 +4,7 @@
 Each possible fault is undone in the recorded messages, which are collected again.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
@@ -204,7 +205,7 @@ def _standing(recorded: Recorded, settings: CollectorSettings) -> Fault | None:
                 f"move the stage to each mark, and name the joint that moves in joint_{axis}",
             )
     named = {(mark.m, mark.n) for mark in _marks(recorded)}
-    if len(named) == 1 and len(_marks(recorded)) > 1:
+    if len(named) == 1 and _way_seen_m(recorded, settings) > STILL * plate.grid_pitch_m:
         m, n = named.pop()
         return Fault(
             f"all marks are called ({m}, {n})",
@@ -232,6 +233,18 @@ def _place(
     where = sample.by_joint
     x, y = (where.get(joint, nan) for joint in (settings.joint_x, settings.joint_y))
     return (x, y) if isfinite(x) and isfinite(y) else None
+
+
+def _way_seen_m(recorded: Recorded, settings: CollectorSettings) -> float:
+    """Return how far apart the stage is indicated where marks are seen; one alone: 0."""
+    indicated = [_place(sample, settings) for sample in recorded.samples]
+    stamps = [sample.stamp_ns for sample in recorded.samples]
+    seen_at = [
+        indicated[min(bisect_left(stamps, mark.stamp_ns), len(stamps) - 1)]
+        for mark in _marks(recorded)
+    ]
+    places = np.array([place for place in seen_at if place is not None])
+    return float(np.ptp(places, axis=0).max()) if len(places) else 0.0
 
 
 def _marks(recorded: Recorded) -> list[Detection]:

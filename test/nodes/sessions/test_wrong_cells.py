@@ -415,7 +415,7 @@ REMEDIES = {
     "x in millimetres": "correct unit or scale of x (m, rad)",
     "inches": "correct unit or scale of x and y (m, rad)",
     "millimetres": "publish joint positions in metres",
-    "half a pitch aside": "place it within 1 mm and 0.5°",
+    "half a pitch aside": "place it within 4 mm and 2°",
     "theta in degrees": "publish theta in rad",
     "frozen theta": "turn the stage to each line",
     "k shifted": "count k from the line along plate x, and set theta to 0",
