@@ -34,7 +34,7 @@ LEAST_RADIUS_M = 0.02
 """Distance from the axis at which an angular error counts at least: the map of a tiny plate may
 turn the stage by any angle otherwise."""
 MOST_ASKED = 100_000
-"""Largest number of positions of a request: 60 ms, for which samples and commands wait."""
+"""Largest number of positions of a request, for which samples and commands wait: 0.1 to 0.5 s."""
 SAME_FIGURE = 1e-6
 """Largest relative difference of a figure of a map and the same figure stated with it."""
 
@@ -454,12 +454,6 @@ class CompensatingSession:
                 f"no error map yet{self._waits and ': '}{self._waits}",
                 "calibrate, or name one with the parameter map",
             )
-        if max(len(axis) for axis in (x, y, theta)) > MOST_ASKED:
-            raise InputError(
-                "request",
-                f"{len(x)} positions, for which samples and commands would wait",
-                f"ask for {MOST_ASKED} at a time, or use selfcal apply",
-            )
         points = [np.asarray(axis, dtype=float) for axis in (x, y, theta)]
         if len(points[0]) != len(points[1]) or len(points[2]) not in (
             0,
@@ -469,6 +463,12 @@ class CompensatingSession:
                 "request",
                 f"{len(x)} x, {len(y)} y and {len(theta)} theta",
                 "give equally many of each; theta may be empty",
+            )
+        if len(x) > MOST_ASKED:
+            raise InputError(
+                "request",
+                f"{len(x)} positions, for which samples and commands would wait",
+                f"ask for {MOST_ASKED} at a time, or use selfcal apply",
             )
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")

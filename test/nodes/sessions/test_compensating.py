@@ -254,7 +254,7 @@ def test_positions_outside_the_field_are_counted_and_told_once(desk):
         ([0.0], [], [], "1 x, 0 y and 0 theta"),
         ([0.0], [0.0], [0.0, 1.0], "1 x, 1 y and 2 theta"),
         ([math.nan], [0.0], [], "a position is not a number"),
-        ([0.0] * (MOST_ASKED + 1), [0.0], [], "ask for 100000 at a time"),
+        (*2 * [[0.0] * (MOST_ASKED + 1)], [], "ask for 100000 at a time"),
         ([-0.02], [-0.02], [], "next to an unknown site"),
     ],
 )
