@@ -290,6 +290,12 @@ def _reading(row: Position, stamp_ns: int) -> Detection:
             "neither a mark nor a line",
             "give m and n of a mark, or neither, or k of a line",
         )
+    of_kind = ("offset_x", "offset_y") if k is None else ("theta", "offset_theta")
+    for column in of_kind:
+        if row.cells.get(column) == "":
+            raise InputError(
+                row.where, f"{column} is empty", "leave the row out if nothing was read"
+            )
     numbers = {
         column: _number(row.cells, column, row.where)
         for column in ("offset_x", "offset_y", "offset_theta", "sigma")

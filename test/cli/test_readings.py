@@ -101,6 +101,7 @@ def test_the_map_holds_within_u_by_the_defaults(cell, tmp_path):
         ({"m": "1.5"}, "m: '1.5' is not a whole number"),
         ({"n": ""}, "neither a mark nor a line; give m and n"),
         ({"k": "3"}, "neither a mark nor a line; give m and n"),
+        ({"offset_y": ""}, "offset_y is empty; leave the row out if nothing was read"),
         ({"offset_x": "nan"}, "offset_x: 'nan' is not a number"),
         ({"view": "other"}, "the plan has no view 'other'"),
         ({"x": "1e3"}, "'1e3' is not a position"),
