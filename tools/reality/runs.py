@@ -29,7 +29,7 @@ from tools.reality.populations import populations
 WRONG = (0.85, 242)
 """Part of the map inside k u below which a single map is called wrong: of 242 correlated
 coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run. Where one
-smooth error dominates, as few are inside by chance: see `share_by_chance`."""
+smooth error dominates, as few are inside by chance: see `beyond_chance`."""
 OF_DRAWS = 0.01, 2000
 """Part of the draws from the covariance of a map that may have fewer errors inside than a map that
 is not wrong, and how many are drawn."""
@@ -196,7 +196,7 @@ def compared(
     holds = not (
         (
             within < limit(int(np.isfinite(error).sum()))
-            and within < share_by_chance(result)
+            and beyond_chance(result, within, z_xy)
         )
         or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1)
     )
@@ -220,8 +220,8 @@ def limit(n_errors: int) -> float:
     return COVERAGE - (COVERAGE - at) * float(np.sqrt(count / max(n_errors, 1)))
 
 
-def share_by_chance(result: CalibrationResult) -> float:
-    """Return the part inside 2 u that only `OF_DRAWS` of maps have less of whose u is right.
+def beyond_chance(result: CalibrationResult, within: float, z_xy: float) -> bool:
+    """Return whether fewer errors are in U, or larger over u, than in `OF_DRAWS` of right maps.
 
     Their errors are drawn from the correlations of the result's own map.
     """
@@ -236,7 +236,11 @@ def share_by_chance(result: CalibrationResult) -> float:
     normal = np.random.default_rng(0).normal(size=(count, len(variances)))
     errors_in_u = normal * np.sqrt(np.maximum(variances, 0.0)) @ modes.T
     k = float(norm.ppf((1 + COVERAGE) / 2))
-    return float(np.quantile(np.mean(np.abs(errors_in_u) <= k, axis=1), part))
+    shares = np.mean(np.abs(errors_in_u) <= k, axis=1)
+    sizes = np.sqrt(np.mean(errors_in_u**2, axis=1))
+    return bool(
+        within < np.quantile(shares, part) or z_xy > np.quantile(sizes, 1 - part)
+    )
 
 
 ROUNDING = 1e-13
