@@ -170,18 +170,21 @@ def calibrate_corrected(
     return calibrate(readings, replace(options, plate=corrected(before)))
 
 
-def _agree(result: CalibrationResult) -> bool:
-    """Return whether the readings agree, whatever the sign of the offsets."""
+def _agree(result: CalibrationResult, *, as_is: bool = True) -> bool:
+    """Return whether the readings agree, whatever the sign of the offsets.
+
+    `as_is`: whether they are those that were given, not wired otherwise to see if that fits.
+    """
     verdict = result.verdict
     of_repeats = {SignNotShown, ScaleOfOffsets, LinesSignNotShown}
-    failed = _contradictions(result)
+    failed = _contradictions(result, as_is=as_is)
     if failed == {SignShownByLines}:
-        return _fits(result)
+        return _fits(result, as_is=as_is)
     failed -= {SignShownByLines}
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
-def _fits(result: CalibrationResult) -> bool:
+def _fits(result: CalibrationResult, *, as_is: bool = True) -> bool:
     """Return whether nothing contradicts the wiring: no test failed, and lines turn as marks do.
 
     That lines alone show the sign contradicts nothing.
@@ -189,20 +192,26 @@ def _fits(result: CalibrationResult) -> bool:
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    return _contradictions(result) <= {SignShownByLines} and not any(
+    return _contradictions(result, as_is=as_is) <= {SignShownByLines} and not any(
         traits_of(cause.name).between
         or abs(cause.size) > traits_of(cause.name).plausible
         for cause in result.verdict.causes
     )
 
 
-def _contradictions(result: CalibrationResult) -> set[type[Finding]]:
-    """Return the tests that failed; residuals below the stated noise contradict no wiring."""
+def _contradictions(result: CalibrationResult, *, as_is: bool) -> set[type[Finding]]:
+    """Return the tests that failed.
+
+    Residuals below the stated noise do not contradict the wiring as it is: the noise may be
+    declared too large. They do not speak for another one either.
+    """
     return {
         type(finding)
         for finding in result.verdict.failed
         if not (
-            isinstance(finding, NoiseContradicted) and finding.size < finding.stated
+            as_is
+            and isinstance(finding, NoiseContradicted)
+            and finding.size < finding.stated
         )
     }
 
@@ -229,8 +238,9 @@ def _check_turned(
         if (turned_solution := solution(wiring)) is None:
             return False
         result = judged(*turned_solution, options, advise=False).result
-        return _agree(result) or (
-            contradicted and options.finite_rotations and _fits(result)
+        as_is = wiring == AS_IS
+        return _agree(result, as_is=as_is) or (
+            contradicted and options.finite_rotations and _fits(result, as_is=as_is)
         )
 
     # a linear model mistakes rotations for a wrong wiring

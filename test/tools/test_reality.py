@@ -111,6 +111,18 @@ def test_fewer_errors_may_lie_inside_by_chance_where_all_have_one_cause():
     assert beyond(halves, 0.49) and not beyond(halves, 0.51)
 
 
+def test_residuals_below_the_noise_do_not_speak_for_another_wiring():
+    """Of a strained plate; the offsets were said to be turned by 180 degrees."""
+    name = (
+        "plate strained by 1 um/m in each view, five views, plates turned by 0.03 deg"
+    )
+    [case] = [case for case in every_case() if case.name == name]
+    _, readings, _ = measured(case, 1, 1)
+    assert "plate_strain" in {
+        cause.name for cause in calibrate(readings, case.options).verdict.causes
+    }
+
+
 def test_cases_have_the_stop_errors_that_their_names_say():
     said = [
         (case.name, case.settings.stop_sigma_m)
