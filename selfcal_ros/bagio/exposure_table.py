@@ -52,6 +52,8 @@ EARLIEST, LATEST = (
     datetime(2038, 1, 18, tzinfo=UTC),
 )
 """Times that a stamp can hold: seconds since 1970 in 32 bits, and commands are stamped earlier."""
+LARGEST_ID = 2**31 - 1
+"""Largest number of a mark or a line that a message holds."""
 FARTHEST_M = 10.0
 FAR = 30
 """Median distance of positions, over that of the plate's edge, which shows another unit than m."""
@@ -144,7 +146,13 @@ def _rows(
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
     for where, texts in lines[1:]:
-        cells = dict(zip(heading, texts, strict=False))
+        if len(texts) != len(heading):
+            raise InputError(
+                where,
+                f"{len(texts)} cells, and the heading has {len(heading)}",
+                "give each row a cell of each column",
+            )
+        cells = dict(zip(heading, texts, strict=True))
         if not all(cells.get(column) for column in columns):
             raise InputError(where, "an empty cell", f"give {', '.join(columns)}")
         view = cells["view"] if plan else ""
@@ -272,13 +280,16 @@ def _index(cells: Mapping[str, str], column: str, where: str) -> int | None:
     if not text:
         return None
     try:
-        return whole_number_of(text)
+        index = whole_number_of(text)
     except ValueError:
+        index = LARGEST_ID + 1
+    if not (0 if column == "k" else -LARGEST_ID) <= index <= LARGEST_ID:
         raise InputError(
             where,
-            f"{column}: '{text}' is not a whole number",
-            "give the id of the mark",
-        ) from None
+            f"{column}: '{text}' is not an id",
+            "give the whole number of the mark",
+        )
+    return index
 
 
 def _reading(row: Position, stamp_ns: int) -> Detection:

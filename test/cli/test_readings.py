@@ -98,7 +98,9 @@ def test_the_map_holds_within_u_by_the_defaults(cell, tmp_path):
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"m": "1.5"}, "m: '1.5' is not a whole number"),
+        ({"m": "1.5"}, "m: '1.5' is not an id; give the whole number of the mark"),
+        ({"m": "99999999999"}, "m: '99999999999' is not an id"),
+        ({"m": "", "n": "", "k": "-1"}, "k: '-1' is not an id"),
         ({"n": ""}, "neither a mark nor a line; give m and n"),
         ({"k": "3"}, "neither a mark nor a line; give m and n"),
         ({"offset_y": ""}, "offset_y is empty; leave the row out if nothing was read"),
@@ -116,6 +118,19 @@ def test_a_wrong_cell_is_named_and_no_bag_written(cell, tmp_path, capsys, change
     assert detect(table, tmp_path / "bag") == 2
     [printed] = capsys.readouterr().err.splitlines()
     assert line in printed and not (tmp_path / "bag").exists()
+
+
+@pytest.mark.parametrize("cells", [6, 11])
+def test_a_row_that_lacks_cells_has_no_offset_of_nought(cell, tmp_path, capsys, cells):
+    """The last of its columns would count as 0; a decimal comma has one more."""
+    table = write(tmp_path / "r.csv", rows_of(cell))
+    lines = table.read_text().splitlines()
+    row = (lines[2] + ",5").split(",")
+    table.write_text("\n".join([*lines[:2], ",".join(row[:cells]), *lines[3:]]))
+    assert detect(table, tmp_path / "bag") == 2
+    [printed] = capsys.readouterr().err.splitlines()
+    assert f"r.csv:3: {cells} cells, and the heading has 10" in printed
+    assert not (tmp_path / "bag").exists()
 
 
 def test_what_is_of_images_is_refused_beside_a_table(cell, tmp_path, capsys):
