@@ -240,9 +240,11 @@ def _lies_as_before(
     z = later.place[second] / WINDOW
     columns = np.stack([np.ones(len(z)), 1j * z], axis=1)
     lies = np.linalg.lstsq(columns, moved, rcond=None)[0]
+    motion = np.sqrt(np.mean(np.abs(columns @ lies) ** 2))
+    if motion >= PLACED_AGAIN_M:
+        return False
     residuals = moved - columns @ lies
     scatter = np.sqrt(np.sum(np.abs(residuals) ** 2) / (4 * (len(z) - 2)))
-    motion = np.sqrt(np.mean(np.abs(columns @ lies) ** 2))
     noise, spread = _sizes(measurements, [earlier, later])
     if not any(view.dof_xy for view in measurements.views):
         noise = scatter  # which nothing else tells
@@ -251,7 +253,6 @@ def _lies_as_before(
         noise < SAME_NOISE_M
         and spread > 2 * noise
         and scatter**2 < NOISE_ALONE * noise**2
-        and motion < PLACED_AGAIN_M
     )
 
 
