@@ -4,6 +4,7 @@
 Each wrong cell fails; the first line names its fault, and what follows from it is told as such.
 """
 
+import re
 import tracemalloc
 from dataclasses import replace
 from itertools import islice
@@ -435,6 +436,24 @@ def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, f
     assert first.remedy.startswith(REMEDIES.get(fault, ""))
     assert first.remedy
     assert {(item.follows, item.remedy) for item in others} <= {(name, "")}
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("deg", [30, -62])
+def test_the_turn_and_mirror_that_are_advised_undo_those_of_the_camera(mirrored, deg):
+    """By the formula of camera.md: R(turn), after the sign of u for a mirror."""
+    fault = f"{'mirrored ' * mirrored}camera turned {deg}"
+    first = next(item for item in checked(fault) if not item.passed)
+    mirror = "mirror: true" in first.remedy
+    turn_deg = float(re.search(r"turn: (-?[\d.]+)", first.remedy)[1])
+    offset = np.array([3e-6 - 1e-6j, 2e-6j])
+    published = np.exp(1j * np.deg2rad(deg)) * offset
+    published = -published.conj() if mirrored else published
+    seen = -published.conj() if mirror else published
+    assert mirror is mirrored
+    np.testing.assert_allclose(
+        np.exp(1j * np.deg2rad(turn_deg)) * seen, offset, rtol=2e-3
+    )
 
 
 def test_a_unit_that_would_make_all_marks_one_is_not_named():
