@@ -13,6 +13,7 @@ from selfcal_msgs.srv import Correct
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.hearing import FOUND_S
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
@@ -25,9 +26,6 @@ LOOK_S = 0.1
 ALONE_S = 1.0
 """Time for which the publisher of a map must be alone before it is used: another one may be found
 later than a latched message."""
-FOUND_S = 4.0
-"""Time after which all publishers have been found by a node that begins: DDS repeats what it
-announces every 3 s, and may miss it before on a busy machine."""
 MOST_WAITING = 20
 """Messages of a topic that wait for that time; of more the oldest are refused."""
 KEPT = "maps from the network are not used until one node alone publishes them"

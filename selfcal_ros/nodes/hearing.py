@@ -13,6 +13,9 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+FOUND_S = 4.0
+"""Time after which a node that begins has found all others: on a busy machine DDS may miss all but
+the announcements that each participant repeats every 3 s."""
 UNNAMED = "a node of unknown name"
 
 

@@ -13,7 +13,7 @@ from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.hearing import UNNAMED, hears, not_heard, others_on
+from selfcal_ros.nodes.hearing import FOUND_S, UNNAMED, hears, not_heard, others_on
 from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.settings.nodes import (
     CollectorSettings,
@@ -43,9 +43,8 @@ IMAGE_DEPTH = 32
 """Images kept for subscribers that have not acknowledged them."""
 BURST, SLICE_S = 100, 0.02
 """Messages between checks of the time and of the subscribers' progress; longest step."""
-LOOK_S, FIRST_LOOK_S = 1.0, 4.0
-"""Time between looks for other publishers, and for finding them before the first message: on a busy
-machine DDS may miss all but the announcements that each participant repeats every 3 s."""
+LOOK_S = 1.0
+"""Time between looks for other publishers."""
 NAME_S = 10.0
 """Longest wait for the name of a node whose publishers are found before it."""
 UNHEARD_RATE = 4000
@@ -234,7 +233,7 @@ class Player:
                 f"{name} publishes {', '.join(topics)} as well; {self._at} messages were played",
                 "end it, or play in another ROS domain",
             )
-        return not other_nodes and (looked_s >= FIRST_LOOK_S or not self.alone_on)
+        return not other_nodes and (looked_s >= FOUND_S or not self.alone_on)
 
     def _other_publishers(self) -> dict[str, list[str]]:
         """Return who else publishes on which topics; selfcal's nodes may, on topics of their own.

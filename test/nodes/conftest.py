@@ -73,7 +73,7 @@ def short_look(monkeypatch):
 
     monkeypatch.setattr(compensator, "FOUND_S", 0.05)
     monkeypatch.setattr(player, "LOOK_S", 0.05)
-    monkeypatch.setattr(player, "FIRST_LOOK_S", 0.05)
+    monkeypatch.setattr(player, "FOUND_S", 0.05)
 
 
 @pytest.fixture

@@ -337,7 +337,7 @@ def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
 
 
 def test_others_are_looked_for_until_dds_has_repeated_itself(graph, bag, monkeypatch):
-    monkeypatch.setattr(player, "FIRST_LOOK_S", 0.5)
+    monkeypatch.setattr(player, "FOUND_S", 0.5)
     begun_s = time.monotonic()
     node = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     graph.until(lambda: node.player.played, "the first message")
