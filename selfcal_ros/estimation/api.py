@@ -6,7 +6,7 @@ from functools import cache
 
 from selfcal_ros.blocks import traits_of
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
-from selfcal_ros.estimation.checks.placing import check_moved, check_placing
+from selfcal_ros.estimation.checks.placing import check_placing, moved_findings
 from selfcal_ros.estimation.checks.wiring import (
     AS_IS,
     OTHER_LINES,
@@ -115,7 +115,7 @@ def calibrate(
     result = solved.result
     if converged and not _agree(result):
         _check_turned(measurements, options, contradicted=not _fits(result))
-    require_placed(result, measurements)
+    result = with_placing(result, measurements)
     if not measurements.has_images:
         return result
     return replace(
@@ -126,14 +126,23 @@ def calibrate(
     )
 
 
-def require_placed(result: CalibrationResult, measurements: Measurements) -> None:
-    """Raise PlacingError if the plate was not moved, or its pose is why a result is not good."""
-    check_moved(measurements)
+def with_placing(
+    result: CalibrationResult, measurements: Measurements
+) -> CalibrationResult:
+    """Return the result, and in it whether the plate may not have been moved between views.
+
+    Raises
+    ------
+    PlacingError
+        If it was not moved, or its pose is why the result is not good.
+    """
+    findings = (*result.findings, *moved_findings(measurements))
     if not (
         result.verdict.qualified and any(view.dof_xy for view in measurements.views)
     ):
         # without repeats residuals are the noise: no contradiction
         check_placing(measurements)
+    return replace(result, findings=findings)
 
 
 def calibrate_corrected(

@@ -410,6 +410,13 @@ class ViewLeftOut(Finding):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlateHardlyMoved(Finding):
+    """A plate without visible errors lies, but for a motion of `size`, as in the view `against`."""
+
+    against: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class RepeatsContradict(Finding):
     """Many of the readings of a view contradict the other repeats of their marks."""
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from selfcal_ros.applications.papers.law import JOINTLY, solve_law
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import calibrate, require_placed
+from selfcal_ros.estimation.api import calibrate, with_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -51,8 +51,7 @@ def calibrate_by_law(measurements: Measurements, options: Options) -> Calibratio
     check_wiring(measurements)
     options = replace(options, misalignment_model="linear")
     solved = judged(solve_law(measurements, options), measurements, options)
-    require_placed(solved.result, measurements)
-    return solved.result
+    return with_placing(solved.result, measurements)
 
 
 def require_plain(measurements: Measurements, options: Options) -> None:

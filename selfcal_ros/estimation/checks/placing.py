@@ -17,7 +17,8 @@ were named.
 A plate that was not moved between two views gives every site the same reading in both: that agrees
 with a plate without errors, and the map is that of stage and plate together. It is told from such a
 plate by its motion, within `PLACED_AGAIN_M`, where plates are compared to `SAME_NOISE_M`: a plate
-with errors below that, placed again within that motion, is taken for it.
+with errors below that, placed again within that motion, is taken for it. With more noise, or more
+motion up to `HARDLY_MOVED_M`, it may be either, which a finding says.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M, MAX_REMOVED
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import PlateHardlyMoved
 from selfcal_ros.model.pose import EDGE, AnyPose, LatticePose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View
@@ -63,6 +65,8 @@ SAME_MARK = 0.1
 PLACED_AGAIN_M, SAME_NOISE_M = 1e-7, 5e-8
 """Motion between two views, m, below which the plate was hardly placed anew, and the largest noise
 of the means, m, with which this is asked."""
+HARDLY_MOVED_M = 1e-6
+"""Motion, m, up to which drift may have moved it."""
 NOISE_ALONE = 1.5
 """Mean square of differences, over that of the noise, above which the plate has errors."""
 SAME_DEG, SAME_PITCHES = 1e-3, 1e-3
@@ -127,8 +131,26 @@ class _WindowReadings:
 
 def check_placing(measurements: Measurements) -> None:
     """Raise PlacingError if the plate is not placed as planned in a view."""
-    if fault := misplaced(measurements):
-        raise placing_error(fault, f"plan '{measurements.plan_id}', ")
+    if fault := _lies_otherwise(measurements, _compared_views(measurements)):
+        raise _error_of_plan(fault, measurements)
+
+
+def moved_findings(measurements: Measurements) -> Iterator[PlateHardlyMoved]:
+    """Yield where the plate may not have been moved before a view of another pose.
+
+    Raises
+    ------
+    PlacingError
+        If it was not.
+    """
+    same = _same_place(measurements, _compared_views(measurements))
+    if same is None:
+        return
+    if same.is_sure:
+        raise _error_of_plan(same.fault, measurements)
+    yield PlateHardlyMoved(
+        view=same.fault.view, against=same.earlier, size=same.motion_m, unit="m"
+    )
 
 
 def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
@@ -137,10 +159,18 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     Or that the frame is mirrored, if that explains all views clearly better than another pose of
     one of them.
     """
-    artifact = measurements.artifact
     compared_views = _compared_views(measurements)
-    if unmoved := _unmoved(measurements, compared_views):
-        return unmoved
+    same = _same_place(measurements, compared_views)
+    if same is not None and same.is_sure:
+        return same.fault
+    return _lies_otherwise(measurements, compared_views)
+
+
+def _lies_otherwise(
+    measurements: Measurements, compared_views: list[tuple[View, _WindowReadings]]
+) -> Misplaced | Mirrored | None:
+    """Return the view at another pose, or the mirrored frame, that explains the readings."""
+    artifact = measurements.artifact
     views = [readings for _, readings in compared_views]
     if len(views) < 3:
         return None
@@ -198,25 +228,40 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     return Misplaced.of(view.plan_view, planned_pose, pose)
 
 
-def check_moved(measurements: Measurements) -> None:
-    """Raise PlacingError if the plate was not moved before a view of another pose."""
-    if fault := _unmoved(measurements, _compared_views(measurements)):
-        raise placing_error(fault, f"plan '{measurements.plan_id}', ")
+@dataclass(frozen=True)
+class _SamePlace:
+    """A view with the plate where it lay in an `earlier` one, but for a motion, m."""
+
+    fault: Misplaced
+    earlier: str
+    motion_m: float
+    is_sure: bool
 
 
-def _unmoved(
+def _same_place(
     measurements: Measurements, compared_views: list[tuple[View, _WindowReadings]]
-) -> Misplaced | None:
-    """Return the first view whose plate was not moved since an earlier one, as placed there."""
+) -> _SamePlace | None:
+    """Return the first view whose plate was not moved since an earlier one, or may not be."""
+    doubtful = None
     for later, (view, readings) in enumerate(compared_views):
         for earlier_view, earlier in compared_views[:later]:
-            if (
-                view.cell == earlier_view.cell
-                and not _placed_alike(readings.pose, earlier.pose)
-                and _lies_as_before(measurements, earlier, readings)
+            if view.cell != earlier_view.cell or _placed_alike(
+                readings.pose, earlier.pose
             ):
-                return Misplaced.of(view.plan_view, readings.pose, earlier.pose)
-    return None
+                continue
+            motion_m, is_sure = _motion_between(measurements, earlier, readings)
+            if motion_m >= HARDLY_MOVED_M:
+                continue
+            same = _SamePlace(
+                Misplaced.of(view.plan_view, readings.pose, earlier.pose),
+                earlier_view.plan_view,
+                motion_m,
+                is_sure,
+            )
+            if is_sure:
+                return same
+            doubtful = doubtful or same
+    return doubtful
 
 
 def _placed_alike(pose: StagePose, other: StagePose) -> bool:
@@ -226,34 +271,35 @@ def _placed_alike(pose: StagePose, other: StagePose) -> bool:
     return bool(abs(turned_deg) < SAME_DEG and np.abs(shifted).max() < SAME_PITCHES)
 
 
-def _lies_as_before(
+def _motion_between(
     measurements: Measurements, earlier: _WindowReadings, later: _WindowReadings
-) -> bool:
-    """Return whether the marks of two views lie at the same places of the stage, within noise."""
+) -> tuple[float, bool]:
+    """Return the motion, m, of a plate between two views, and whether it was hardly placed anew.
+
+    Infinite if its marks do not lie at the same places of the stage, but for motion and noise.
+    """
     earlier_site, later_site = (
         np.round(readings.place / SAME_MARK) for readings in (earlier, later)
     )
     _, first, second = np.intersect1d(earlier_site, later_site, return_indices=True)
     if len(first) < LEAST_READINGS:
-        return False
+        return np.inf, False
     moved = later.deviation[second] - earlier.deviation[first]
     z = later.place[second] / WINDOW
     columns = np.stack([np.ones(len(z)), 1j * z], axis=1)
     lies = np.linalg.lstsq(columns, moved, rcond=None)[0]
-    motion = np.sqrt(np.mean(np.abs(columns @ lies) ** 2))
-    if motion >= PLACED_AGAIN_M:
-        return False
+    motion = float(np.sqrt(np.mean(np.abs(columns @ lies) ** 2)))
+    if motion >= HARDLY_MOVED_M:
+        return motion, False
     residuals = moved - columns @ lies
     scatter = np.sqrt(np.sum(np.abs(residuals) ** 2) / (4 * (len(z) - 2)))
     noise, spread = _sizes(measurements, [earlier, later])
     if not any(view.dof_xy for view in measurements.views):
         noise = scatter  # which nothing else tells
     noise = max(noise, LEAST_NOISE_M)
-    return bool(
-        noise < SAME_NOISE_M
-        and spread > 2 * noise
-        and scatter**2 < NOISE_ALONE * noise**2
-    )
+    if spread <= 2 * noise or scatter**2 >= NOISE_ALONE * noise**2:
+        return np.inf, False
+    return motion, bool(motion < PLACED_AGAIN_M and noise < SAME_NOISE_M)
 
 
 def _compared_views(measurements: Measurements) -> list[tuple[View, _WindowReadings]]:
@@ -666,6 +712,12 @@ def placing_error(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingE
         fault,
         f"{how} and measure this view again, or correct its pose in the plan",
     )
+
+
+def _error_of_plan(
+    fault: Misplaced | Mirrored, measurements: Measurements
+) -> PlacingError:
+    return placing_error(fault, f"plan '{measurements.plan_id}', ")
 
 
 def _pitches(shift: tuple[float, float]) -> str:

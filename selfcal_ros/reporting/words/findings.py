@@ -39,6 +39,7 @@ from selfcal_ros.model.findings import (
     OutliersKept,
     OutliersRemoved,
     OwnTermsUnknown,
+    PlateHardlyMoved,
     PredictionFailed,
     ReferenceOff,
     Remedy,
@@ -563,6 +564,15 @@ def _(finding: OutliersRemoved) -> str:
     return (
         f"removed {counted(finding.number, 'outlier')}: "
         f"{some_of(named, len(named), finding.number)}"
+    )
+
+
+@sentence_of.register
+def _(finding: PlateHardlyMoved) -> str:
+    return (
+        f"view '{finding.view}': the plate lies within {finding.size * UM_PER_M:.2g} µm of where "
+        f"it lay in view '{finding.against}', and shows no errors of its own: if it was not placed "
+        "anew, its errors are in the map; place it some µm elsewhere"
     )
 
 

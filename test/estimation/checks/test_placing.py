@@ -14,6 +14,7 @@ from selfcal_ros.estimation.checks.placing import (
     PlacingError,
     _placed_alike,
     misplaced,
+    moved_findings,
     other_poses,
 )
 from selfcal_ros.estimation.options import Options
@@ -167,6 +168,23 @@ def test_a_plate_that_was_not_moved_is_not_one_without_errors(planned, repeated)
     )
     found = misplaced(still)
     assert found.found_deg == 0 and np.abs(found.found_shift).max() == 0
+
+
+@pytest.mark.parametrize(("again_m", "noise_m"), [(3e-7, 1.4e-8), (0.0, 8e-8)])
+def test_a_plate_that_may_not_have_been_moved_is_named_beside_a_good_map(
+    again_m, noise_m
+):
+    """By a drift, or within so much noise, that it may also be a plate without errors."""
+    readings, names = read("0, 90", "0, 90")
+    rng = np.random.default_rng(5)
+    still = laid_once(readings, rng, again_m=again_m, noise_m=noise_m)
+    views = [replace(view, sigma_xy=2**0.5 * noise_m) for view in still.views]
+    still = replace(still, views=tuple(views))
+    assert misplaced(still) is None
+    (finding,) = moved_findings(still)
+    assert (finding.view, finding.against) == (names[1], names[0])
+    assert finding.size == pytest.approx(again_m * 2**0.5, abs=noise_m)
+    assert not list(moved_findings(readings))
 
 
 def test_a_view_that_was_not_placed_anew_is_named_among_others():

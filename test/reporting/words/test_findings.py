@@ -33,6 +33,7 @@ from selfcal_ros.model.findings import (
     OutliersKept,
     OutliersRemoved,
     OwnTermsUnknown,
+    PlateHardlyMoved,
     PredictionFailed,
     ReferenceOff,
     Remedy,
@@ -494,6 +495,12 @@ FINDINGS = [
         "11) of the map rest on single readings that no other checks; an error in "
         "them goes into the map, and no residual shows it: measure the missing marks, "
         "or add a view",
+    ),
+    (
+        PlateHardlyMoved(view="90", against="0", size=3e-7, unit="m"),
+        "view '90': the plate lies within 0.3 µm of where it lay in view '0', and shows no errors "
+        "of its own: if it was not placed anew, its errors are in the map; place it some µm "
+        "elsewhere",
     ),
     (
         unchecked([], [4]),
