@@ -9,6 +9,7 @@ venv="$PWD/${VENV:-.venv}"
 build="build${VENV:+/${VENV#.}}"
 pins="${PINS:-/dev/null}"
 die() { echo "setup: $*" >&2; exit 2; }
+[[ "$PWD" != *[\'\"\$=,\;:\\]* ]] || die "ROS's build tools do not work in $PWD, because of a quote or one of \$ = , ; : \\ in its path; move the clone elsewhere"
 
 suitable() {  # runs, and is a version for which the ROS 2 wheels exist and the code is written
   "$1" -c 'import sys, venv, ensurepip; sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null
@@ -77,13 +78,16 @@ fi
 
 messages=$(find msg_defs -type f | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
 if ! fresh messages "$messages"; then
-  rm -rf "$build/selfcal_msgs"
+  scratch=$(mktemp -d)  # rosidl reads no path with letters beyond ASCII
+  trap 'rm -rf "$scratch"' EXIT
+  cp -r msg_defs "$scratch"
   # -j in MAKEFLAGS: else colcon has ninja wait while the load is high, and everything is serial
   step "building selfcal_msgs" env PATH="$venv/bin:$PATH" LD_LIBRARY_PATH="$venv/lib" \
     MAKEFLAGS="-j$(nproc)" \
     AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
-    "$venv/bin/colcon" --log-base "$build/colcon_log" build --base-paths msg_defs --build-base "$build" \
-    --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF -DPYTHON_ONLY=ON \
+    "$venv/bin/colcon" --log-base "$build/colcon_log" build --base-paths "$scratch/msg_defs" \
+    --build-base "$scratch/build" --merge-install --install-base "$venv" \
+    --cmake-args -G Ninja -DBUILD_TESTING=OFF -DPYTHON_ONLY=ON \
     "-DPython3_EXECUTABLE=$venv/bin/python" --no-warn-unused-cli
   stamp messages "$messages"
 fi

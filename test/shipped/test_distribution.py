@@ -172,6 +172,17 @@ def test_every_pin_has_the_hashes_of_its_files(name):
     assert "--require-hashes" in (ROOT / "tools/setup.sh").read_text()
 
 
+@pytest.mark.parametrize("name", ["a'b", "a$b", "a=b", "a;b", "a:b", "a\\b"])
+def test_a_folder_that_the_tools_of_ros_cannot_take_is_named_first(tmp_path, name):
+    """It ended in errors of CMake after half a minute."""
+    setup = tmp_path / name / "tools" / "setup.sh"
+    setup.parent.mkdir(parents=True)
+    shutil.copy(ROOT / "tools" / "setup.sh", setup)
+    done = subprocess.run([setup], capture_output=True, text=True)
+    assert done.returncode == 2 and "move the clone" in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and not done.stdout
+
+
 def components() -> list[dict]:
     return read_json(ROOT / "sbom.json")["components"]
 
