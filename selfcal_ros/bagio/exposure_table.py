@@ -204,8 +204,18 @@ def _check_heading(
             )
     if further is None:
         return
+    if ("offset_x" in heading) != ("offset_y" in heading):
+        raise InputError(
+            path,
+            "one of offset_x and offset_y without the other, which would count as 0",
+            "give both, or neither where each mark was centred",
+        )
     known_columns = list(dict.fromkeys([*columns, *further, TIME]))
     for column in heading:
+        if not column:
+            raise InputError(
+                path, "a column without a name", "delete it with its cells, or name it"
+            )
         if heading.count(column) > 1:
             raise InputError(path, f"two columns '{column}'", "leave one out")
         if column not in known_columns:

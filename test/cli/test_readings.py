@@ -133,6 +133,27 @@ def test_a_row_that_lacks_cells_has_no_offset_of_nought(cell, tmp_path, capsys, 
     assert not (tmp_path / "bag").exists()
 
 
+def test_empty_columns_at_the_end_are_named(cell, tmp_path, capsys):
+    """Spreadsheets write them."""
+    table = write(tmp_path / "r.csv", rows_of(cell))
+    table.write_text(table.read_text().replace("\n", ",,\n"))
+    assert detect(table, tmp_path / "bag") == 2
+    [printed] = capsys.readouterr().err.splitlines()
+    assert "a column without a name; delete it" in printed
+
+
+@pytest.mark.parametrize("missing", ["offset_x", "offset_y"])
+def test_offsets_of_one_axis_are_refused(cell, tmp_path, capsys, missing):
+    """The stage would have no error along the other axis."""
+    first, *others = rows_of(cell)
+    columns = [column for column in first if column != missing]
+    table = write(tmp_path / "r.csv", [first, *others], columns)
+    assert detect(table, tmp_path / "bag") == 2
+    [printed] = capsys.readouterr().err.splitlines()
+    assert "one of offset_x and offset_y without the other" in printed
+    assert not (tmp_path / "bag").exists()
+
+
 def test_what_is_of_images_is_refused_beside_a_table(cell, tmp_path, capsys):
     table = write(tmp_path / "r.csv", rows_of(cell))
     assert detect(table, tmp_path / "bag", "--mark-size", "1e-5") == 2
