@@ -311,6 +311,10 @@ def _reading(row: Position, stamp_ns: int) -> Detection:
             "neither a mark nor a line",
             "give m and n of a mark, or neither, or k of a line",
         )
+    if k is not None and "theta" not in row.cells:
+        raise InputError(
+            row.where, "a line without the indicated angle", "add a column theta"
+        )
     of_kind = ("offset_x", "offset_y") if k is None else ("theta", "offset_theta")
     for column in of_kind:
         if row.cells.get(column) == "":

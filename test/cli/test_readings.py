@@ -133,6 +133,17 @@ def test_a_row_that_lacks_cells_has_no_offset_of_nought(cell, tmp_path, capsys, 
     assert not (tmp_path / "bag").exists()
 
 
+def test_a_line_without_its_angle_is_refused(cell, tmp_path, capsys):
+    """The angle would count as 0."""
+    first, *others = rows_of(cell)
+    columns = [column for column in first if column != "theta"]
+    table = write(tmp_path / "r.csv", [first, *others], columns)
+    assert detect(table, tmp_path / "bag") == 2
+    [printed] = capsys.readouterr().err.splitlines()
+    assert "a line without the indicated angle; add a column theta" in printed
+    assert not (tmp_path / "bag").exists()
+
+
 def test_empty_columns_at_the_end_are_named(cell, tmp_path, capsys):
     """Spreadsheets write them."""
     table = write(tmp_path / "r.csv", rows_of(cell))
