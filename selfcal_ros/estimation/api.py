@@ -40,6 +40,7 @@ from selfcal_ros.model.findings import (
     Finding,
     LinesSignNotShown,
     NoiseContradicted,
+    NoOffsets,
     ScaleOfOffsets,
     SignNotShown,
     SignShownByLines,
@@ -185,7 +186,7 @@ def _agree(result: CalibrationResult, *, as_is: bool = True) -> bool:
     `as_is`: whether they are those that were given, not wired otherwise to see if that fits.
     """
     verdict = result.verdict
-    of_repeats = {SignNotShown, ScaleOfOffsets, LinesSignNotShown}
+    of_repeats = {SignNotShown, NoOffsets, ScaleOfOffsets, LinesSignNotShown}
     failed = _contradictions(result, as_is=as_is)
     if failed == {SignShownByLines}:
         return _fits(result, as_is=as_is)

@@ -194,6 +194,10 @@ class SignNotShown(Finding):
     """Nothing shows the sign of the offsets of marks."""
 
 
+class NoOffsets(Finding):
+    """All offsets of marks are 0: of marks that were centred, or of a detector that is dead."""
+
+
 class SignShownByLines(Finding):
     """Only the offsets of lines show the sign of the offsets of marks."""
 

@@ -460,17 +460,23 @@ def without_noise(
     terms = of_terms or [0.0] * len(inputs.visits)
     for view, residual, of_model in zip(inputs.visits, residuals, terms, strict=True):
         if view is not None:
-            within = view.about_means((view.y - of_model)[None], residual.size)[0]
+            within, offsets_within = (
+                view.about_means(values[None], residual.size)[0]
+                for values in (view.y - of_model, view.offset)
+            )
             means = residual.reshape(-1)[view.mark]
             turned = (view.frame - 1) * marks[view.mark]
             stood = (view.y - turned) * np.conj(view.phase) - view.offset
-            of_offsets, of_stops, of_means = (
+            of_offsets, of_stops, of_means, of_within, of_offsets_within = (
                 float(np.sum(np.abs(values) ** 2))
-                for values in (view.offset, stood, means)
+                for values in (view.offset, stood, means, within, offsets_within)
             )
+            noise = within + means
             # of a stage that follows its marks: offsets hold no more than they are
-            followed = of_offsets < min(of_stops, of_means)
-            noise = within + means * (of_offsets / of_means if followed else 1.0)
+            if of_offsets < min(of_stops, of_means):
+                noise = means * (of_offsets / of_means)
+                if of_within > 0:
+                    noise += within * min(of_offsets_within / of_within, 1.0)
             view = replace(view, offset=view.offset - noise * np.conj(view.phase))
         visits.append(view)
     return replace(inputs, visits=tuple(visits))

@@ -72,6 +72,7 @@ from selfcal_ros.model.findings import (
     LinesSignNotShown,
     NoiseContradicted,
     NoiseUnknown,
+    NoOffsets,
     NotConverged,
     RepeatsContradict,
     RoughnessUntested,
@@ -385,7 +386,11 @@ def _sign_findings(
         is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)
     ):
         return
-    if not _stops_show_the_sign(model, measurements):
+    if not any(
+        view is not None and view.offset.any() for view in model.problem.inputs.visits
+    ):
+        yield NoOffsets()
+    elif not _stops_show_the_sign(model, measurements):
         yield SignShownByLines() if with_lines else SignNotShown()
 
 

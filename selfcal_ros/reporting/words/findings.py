@@ -30,6 +30,7 @@ from selfcal_ros.model.findings import (
     NoiseContradicted,
     NoiseUnknown,
     NoisyView,
+    NoOffsets,
     NotConverged,
     NothingToPredict,
     NotIdentified,
@@ -268,6 +269,11 @@ FIXED: dict[type, str] = {
         "nothing in the readings shows the sign of the microscope's offsets, and with the opposite "
         "sign the map would be that of a different stage: have the stage stop next to the marks "
         "deliberately (check_stops in the plan), or declare the microscope (--microscope 0.01)"
+    ),
+    NoOffsets: (
+        "all offsets of marks are 0: if the stage was driven until each mark was centred, say so "
+        "(--microscope 0.01); if not, the detector measures nothing, and the map is that of the "
+        "stage's targets"
     ),
     SignShownByLines: (
         "only lines that turn with the marks show the sign of the microscope's offsets, and "

@@ -9,6 +9,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import Turned, WiringError, turned_readings
+from selfcal_ros.estimation.joint.problem import repeats_of
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import search
@@ -16,7 +17,7 @@ from selfcal_ros.estimation.verdict.judge import judged, provenance_of
 from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.findings import AxesNotMet
+from selfcal_ros.model.findings import AxesNotMet, NoOffsets
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
@@ -196,6 +197,41 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     verdict = calibrate(offsets_of(*scatter), Options(**how)).verdict
     assert [found.name for found in verdict.failed] == asked
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
+
+
+def centred(readings, rng, *, within_m=0.0):
+    """Return the readings of a stage that is driven until each mark is centred to `within_m`."""
+    views = []
+    for view in readings.views:
+        visits = view.visits
+        if visits is None:
+            views.append(view)
+            continue
+        x, y = rng.normal(0, within_m, (2, len(visits.mark)))
+        motion = replace(view.motion, products=np.diag([1.0, 1.0, 0.0, 0.0]) * 4e-14)
+        views.append(
+            replace(view, visits=replace(visits, offset_x=x, offset_y=y), motion=motion)
+        )
+    return replace(readings, views=tuple(views))
+
+
+@pytest.mark.parametrize("within_m", [0.0, 2e-9])
+def test_repeats_of_centred_marks_show_their_noise(within_m):
+    """It was 1.6 times as large: as a column, the noise taken off offsets of 0 was the noise."""
+    readings = centred(
+        offsets_of(0.0, 1e-4), np.random.default_rng(5), within_m=within_m
+    )
+    options = Options(terms=parse_terms(["microscope:1e-2"], ""))
+    result = calibrate(readings, options)
+    assert result.verdict.grade is Grade.GOOD
+    ratio = result.noise.sigma_xy_repeats / repeats_of(readings)[0][0]
+    assert ratio == pytest.approx(1, abs=0.05)
+
+
+def test_offsets_that_are_all_0_are_declared_or_not_qualified():
+    """A detector that is dead gives them as well."""
+    readings = centred(offsets_of(0.0, 1e-4), np.random.default_rng(5))
+    assert calibrate(readings).verdict.failed == (NoOffsets(),)
 
 
 def repeated_to_the_bit(readings):

@@ -26,6 +26,7 @@ from selfcal_ros.model.findings import (
     NoiseContradicted,
     NoiseUnknown,
     NoisyView,
+    NoOffsets,
     NotIdentified,
     NoUncertainty,
     OutlierRemoved,
@@ -445,6 +446,12 @@ FINDINGS = [
         "angular readings: residuals show a noise of 1 arcsec, the detections' own sigma 2 arcsec; "
         "repeats share what single readings do not (drift between passes), or the stated noise is "
         "too large",
+    ),
+    (
+        NoOffsets(),
+        "all offsets of marks are 0: if the stage was driven until each mark was centred, say so "
+        "(--microscope 0.01); if not, the detector measures nothing, and the map is that of the "
+        "stage's targets",
     ),
     (
         NoiseUnknown(),
