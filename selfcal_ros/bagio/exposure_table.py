@@ -136,6 +136,8 @@ def _rows(
     """Return the rows of a table, by view; `further`: the only other columns that it may have."""
     lines = csv_rows(read_text(path), str(path))
     heading = lines[0][1] if lines else []
+    while heading and not heading[-1]:  # columns that a spreadsheet once had
+        heading = heading[:-1]
     columns = [column for column in needed if plan or column != "view"]
     columns += [TIME] if TIME in heading else []
     _check_heading(heading, str(path), columns, further)
@@ -146,13 +148,13 @@ def _rows(
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
     for where, texts in lines[1:]:
-        if len(texts) != len(heading):
+        if len(texts) < len(heading) or any(texts[len(heading) :]):
             raise InputError(
                 where,
                 f"{len(texts)} cells, and the heading has {len(heading)}",
                 "give each row a cell of each column",
             )
-        cells = dict(zip(heading, texts, strict=True))
+        cells = dict(zip(heading, texts, strict=False))
         if not all(cells.get(column) for column in columns):
             raise InputError(where, "an empty cell", f"give {', '.join(columns)}")
         view = cells["view"] if plan else ""

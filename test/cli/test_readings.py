@@ -77,10 +77,11 @@ def test_the_map_is_that_of_the_cell_whose_readings_are_in_the_table(
 
 
 def test_the_map_holds_within_u_by_the_defaults(cell, tmp_path):
-    """Without ids, columns in another order, a comment, and a byte order mark."""
+    """Without ids, columns in another order, a comment, a byte order mark, and empty columns."""
     columns = ["k", "offset_y", "view", "x", "y", "offset_theta", "theta", "offset_x"]
     table = write(tmp_path / "Readings.CSV", rows_of(cell), columns)
-    table.write_text("\ufeff# by hand\n" + table.read_text())
+    rows = [f"{line},," for line in table.read_text().splitlines()]
+    table.write_text("\n".join(["\ufeff# by hand", *rows]))
     assert detect(table, tmp_path / "bag") == 0
     out = str(tmp_path / "R.json")
     assert main(["solve", str(tmp_path / "bag"), "-o", out]) == 0
