@@ -2,6 +2,7 @@
 """Bags and results are worked on without what only Linux and macOS, or Linux alone, have."""
 
 import json
+import shlex
 import subprocess
 import sys
 
@@ -10,7 +11,7 @@ import pytest
 from test.support.sources import ROOT
 
 WITHOUT = """
-import os, shutil, signal, sys
+import os, shlex, shutil, signal, sys
 shutil._use_fd_functions = False  # as where os has no dir_fd
 for name in ("fcntl", "termios", "tty", "pty", "resource", "pwd", "grp"):
     sys.modules[name] = None
@@ -21,7 +22,7 @@ for module, names in ((os, ("O_NONBLOCK", "O_NOFOLLOW", "O_CLOEXEC", "sched_geta
 from selfcal_ros.start import selfcal
 code = 0
 for line in sys.stdin.read().splitlines():
-    sys.argv = ["selfcal", *line.split()]
+    sys.argv = ["selfcal", *shlex.split(line)]
     found = selfcal()
     print("code", found, line, file=sys.stderr)
 """
@@ -44,7 +45,8 @@ def run(folder, *lines):
 
 
 def test_from_bag_to_map_report_and_tables(tmp_path):
-    bag = ROOT / "bags/demo"
+    root = shlex.quote(str(ROOT))
+    bag = f"{root}/bags/demo"
     (tmp_path / "points.csv").write_text("x,y\n0,0\n")
     lines = (
         f"solve {bag} -o r.json --quiet",
@@ -56,8 +58,8 @@ def test_from_bag_to_map_report_and_tables(tmp_path):
         "export siemens r.json -o t.ini --unit mm",
         "cal export r.json -o s.cal",
         f"batch {bag} -o batch --workers 1",
-        f"plan check {ROOT}/config/plans/hu.yaml",
-        f"simulate {ROOT}/config/simulations/recheck.yaml -o simulated",
+        f"plan check {root}/config/plans/hu.yaml",
+        f"simulate {root}/config/simulations/recheck.yaml -o simulated",
     )
     codes, error = run(tmp_path, *lines)
     assert codes == [f"code 0 {line}" for line in lines], error

@@ -99,7 +99,7 @@ def start(ros_environment):
 def processes_of(session: int) -> list[str]:
     """Return the processes of a session, each as its id and its arguments."""
     return subprocess.run(
-        ["ps", "-o", "pid=,args=", "-s", str(session)],
+        ["ps", "-ww", "-o", "pid=,args=", "-s", str(session)],
         text=True,
         capture_output=True,
         check=False,
