@@ -145,10 +145,11 @@ def test_a_line_without_its_angle_is_refused(cell, tmp_path, capsys):
     assert not (tmp_path / "bag").exists()
 
 
-def test_empty_columns_at_the_end_are_named(cell, tmp_path, capsys):
-    """Spreadsheets write them."""
+def test_a_column_without_a_name_is_named(cell, tmp_path, capsys):
+    """Libraries of tables write the number of each row into one."""
     table = write(tmp_path / "r.csv", rows_of(cell))
-    table.write_text(table.read_text().replace("\n", ",,\n"))
+    rows = [f",{line}" for line in table.read_text().splitlines()]
+    table.write_text("\n".join(rows))
     assert detect(table, tmp_path / "bag") == 2
     [printed] = capsys.readouterr().err.splitlines()
     assert "a column without a name; delete it" in printed
