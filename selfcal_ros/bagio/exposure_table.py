@@ -136,6 +136,7 @@ def _rows(
     """Return the rows of a table, by view; `further`: the only other columns that it may have."""
     lines = csv_rows(read_text(path), str(path))
     heading = lines[0][1] if lines else []
+    n_cells = len(heading)
     while heading and not heading[-1]:  # columns that a spreadsheet once had
         heading = heading[:-1]
     columns = [column for column in needed if plan or column != "view"]
@@ -148,10 +149,10 @@ def _rows(
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
     for where, texts in lines[1:]:
-        if len(texts) < len(heading) or any(texts[len(heading) :]):
+        if len(texts) != n_cells or any(texts[len(heading) :]):
             raise InputError(
                 where,
-                f"{len(texts)} cells, and the heading has {len(heading)}",
+                f"{len(texts)} cells, and the heading names {len(heading)}",
                 "give each row a cell of each column",
             )
         cells = dict(zip(heading, texts, strict=False))

@@ -123,14 +123,14 @@ def test_a_wrong_cell_is_named_and_no_bag_written(cell, tmp_path, capsys, change
 
 @pytest.mark.parametrize("cells", [6, 11])
 def test_a_row_that_lacks_cells_has_no_offset_of_nought(cell, tmp_path, capsys, cells):
-    """The last of its columns would count as 0; a decimal comma has one more."""
+    """The last of its columns would count as 0; one more may come of a decimal comma."""
     table = write(tmp_path / "r.csv", rows_of(cell))
     lines = table.read_text().splitlines()
-    row = (lines[2] + ",5").split(",")
+    row = (lines[2] + ",").split(",")
     table.write_text("\n".join([*lines[:2], ",".join(row[:cells]), *lines[3:]]))
     assert detect(table, tmp_path / "bag") == 2
     [printed] = capsys.readouterr().err.splitlines()
-    assert f"r.csv:3: {cells} cells, and the heading has 10" in printed
+    assert f"r.csv:3: {cells} cells, and the heading names 10" in printed
     assert not (tmp_path / "bag").exists()
 
 
@@ -143,6 +143,16 @@ def test_a_line_without_its_angle_is_refused(cell, tmp_path, capsys):
     [printed] = capsys.readouterr().err.splitlines()
     assert "a line without the indicated angle; add a column theta" in printed
     assert not (tmp_path / "bag").exists()
+
+
+def test_cells_below_no_name_are_not_passed_over(cell, tmp_path, capsys):
+    table = write(tmp_path / "r.csv", rows_of(cell))
+    heading, first, *lines = table.read_text().splitlines()
+    rows = [f"{heading},", f"{first},5", *(f"{line}," for line in lines)]
+    table.write_text("\n".join(rows))
+    assert detect(table, tmp_path / "bag") == 2
+    [printed] = capsys.readouterr().err.splitlines()
+    assert "r.csv:2: 11 cells, and the heading names 10" in printed
 
 
 def test_a_column_without_a_name_is_named(cell, tmp_path, capsys):

@@ -199,20 +199,25 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
 
 
+def visited(readings, change):
+    """Return the readings with each view that has visits changed."""
+    views = (
+        view if view.visits is None else change(view, view.visits)
+        for view in readings.views
+    )
+    return replace(readings, views=tuple(views))
+
+
 def centred(readings, rng, *, within_m=0.0):
     """Return the readings of a stage that is driven until each mark is centred to `within_m`."""
-    views = []
-    for view in readings.views:
-        visits = view.visits
-        if visits is None:
-            views.append(view)
-            continue
+
+    def change(view, visits):
         x, y = rng.normal(0, within_m, (2, len(visits.mark)))
         motion = replace(view.motion, products=np.diag([1.0, 1.0, 0.0, 0.0]) * 4e-14)
-        views.append(
-            replace(view, visits=replace(visits, offset_x=x, offset_y=y), motion=motion)
-        )
-    return replace(readings, views=tuple(views))
+        visits = replace(visits, offset_x=x, offset_y=y)
+        return replace(view, visits=visits, motion=motion)
+
+    return visited(readings, change)
 
 
 @pytest.mark.parametrize("within_m", [0.0, 2e-9])
@@ -236,28 +241,23 @@ def test_offsets_that_are_all_0_are_declared_or_not_qualified():
 
 def repeated_to_the_bit(readings):
     """Return the readings of a detector that answers a second visit with its first answer."""
-    views = []
-    for view in readings.views:
-        visits = view.visits
-        if visits is None:
-            views.append(view)
-            continue
+
+    def change(view, visits):
         first = np.searchsorted(visits.mark, np.arange(len(view.m)))
         same = {
             name: getattr(visits, name)[first[visits.mark]]
             for name in ("dx", "dy", "offset_x", "offset_y")
         }
-        views.append(
-            replace(
-                view,
-                dx=visits.dx[first],
-                dy=visits.dy[first],
-                sigma_xy=0.0,
-                motion=replace(view.motion, products=np.zeros((4, 4))),
-                visits=replace(visits, **same),
-            )
+        return replace(
+            view,
+            dx=visits.dx[first],
+            dy=visits.dy[first],
+            sigma_xy=0.0,
+            motion=replace(view.motion, products=np.zeros((4, 4))),
+            visits=replace(visits, **same),
         )
-    return replace(readings, views=tuple(views))
+
+    return visited(readings, change)
 
 
 @pytest.mark.parametrize("seed", range(3))
