@@ -249,16 +249,15 @@ def _same_place(
                 readings.pose, earlier.pose
             ):
                 continue
-            motion_m, is_sure = _motion_between(measurements, earlier, readings)
-            if motion_m >= HARDLY_MOVED_M:
+            motion = _motion_between(measurements, earlier, readings)
+            if motion is None:
                 continue
             same = _SamePlace(
                 Misplaced.of(view.plan_view, readings.pose, earlier.pose),
                 earlier_view.plan_view,
-                motion_m,
-                is_sure,
+                *motion,
             )
-            if is_sure:
+            if same.is_sure:
                 return same
             doubtful = doubtful or same
     return doubtful
@@ -273,24 +272,25 @@ def _placed_alike(pose: StagePose, other: StagePose) -> bool:
 
 def _motion_between(
     measurements: Measurements, earlier: _WindowReadings, later: _WindowReadings
-) -> tuple[float, bool]:
-    """Return the motion, m, of a plate between two views, and whether it was hardly placed anew.
+) -> tuple[float, bool] | None:
+    """Return the motion, m, of a plate between two views, and whether it was surely not moved.
 
-    Infinite if its marks do not lie at the same places of the stage, but for motion and noise.
+    None from `HARDLY_MOVED_M` on, and if its marks do not lie at the same places of the stage, but
+    for motion and noise.
     """
     earlier_site, later_site = (
         np.round(readings.place / SAME_MARK) for readings in (earlier, later)
     )
     _, first, second = np.intersect1d(earlier_site, later_site, return_indices=True)
     if len(first) < LEAST_READINGS:
-        return np.inf, False
+        return None
     moved = later.deviation[second] - earlier.deviation[first]
     z = later.place[second] / WINDOW
     columns = np.stack([np.ones(len(z)), 1j * z], axis=1)
     lies = np.linalg.lstsq(columns, moved, rcond=None)[0]
     motion = float(np.sqrt(np.mean(np.abs(columns @ lies) ** 2)))
     if motion >= HARDLY_MOVED_M:
-        return motion, False
+        return None
     residuals = moved - columns @ lies
     scatter = np.sqrt(np.sum(np.abs(residuals) ** 2) / (4 * (len(z) - 2)))
     noise, spread = _sizes(measurements, [earlier, later])
@@ -298,7 +298,7 @@ def _motion_between(
         noise = scatter  # which nothing else tells
     noise = max(noise, LEAST_NOISE_M)
     if spread <= 2 * noise or scatter**2 >= NOISE_ALONE * noise**2:
-        return np.inf, False
+        return None
     return motion, bool(motion < PLACED_AGAIN_M and noise < SAME_NOISE_M)
 
 

@@ -202,7 +202,9 @@ def test_a_plate_without_errors_is_not_one_that_was_not_moved():
     truth = random_truth(readings.artifact, 3, rng)
     truth = replace(truth, a=0.0 * truth.a)
     plan = plan_of("0, 90, tx", 7, count=0, repeats=2)
-    assert misplaced(simulate_measurements(truth, plan, rng, sigma_m=2e-8)) is None
+    placed_again = simulate_measurements(truth, plan, rng, sigma_m=2e-8)
+    assert misplaced(placed_again) is None
+    assert not list(moved_findings(placed_again))
 
 
 @pytest.mark.parametrize(
