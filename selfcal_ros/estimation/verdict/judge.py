@@ -25,6 +25,7 @@ from selfcal_ros.estimation.checks.wiring import (
     MAX_REMOVED,
     SHOWN,
     contradicted_scale,
+    shows_offsets,
     sign_is_shown,
     sign_of_lines_is_shown,
 )
@@ -353,11 +354,11 @@ def _sign_findings(
     rotations that lines share, and their squares), or the microscope was declared. Lines share
     rotations with the other sign as well if it is that of their own offsets, too.
     """
-    visits_known = all(
-        view.visits is not None for view in measurements.views if len(view.m)
-    )
-    # nothing can show it
-    if _is_declared(options) or not visits_known or sign_is_shown(measurements):
+    if (
+        _is_declared(options)
+        or not shows_offsets(measurements)  # nothing can show it
+        or sign_is_shown(measurements)
+    ):
         return
     model = (
         solved.model if options.finite_rotations else _rigid_fit(measurements, options)
