@@ -134,17 +134,6 @@ def test_a_row_that_lacks_cells_has_no_offset_of_nought(cell, tmp_path, capsys, 
     assert not (tmp_path / "bag").exists()
 
 
-def test_a_line_without_its_angle_is_refused(cell, tmp_path, capsys):
-    """The angle would count as 0."""
-    first, *others = rows_of(cell)
-    columns = [column for column in first if column != "theta"]
-    table = write(tmp_path / "r.csv", [first, *others], columns)
-    assert detect(table, tmp_path / "bag") == 2
-    [printed] = capsys.readouterr().err.splitlines()
-    assert "a line without the indicated angle; add a column theta" in printed
-    assert not (tmp_path / "bag").exists()
-
-
 def test_cells_below_no_name_are_not_passed_over(cell, tmp_path, capsys):
     table = write(tmp_path / "r.csv", rows_of(cell))
     heading, first, *lines = table.read_text().splitlines()
@@ -165,16 +154,23 @@ def test_a_column_without_a_name_is_named(cell, tmp_path, capsys):
     assert "a column without a name; delete it" in printed
 
 
-@pytest.mark.parametrize("missing", ["offset_x", "offset_y"])
-def test_offsets_of_one_axis_are_refused(cell, tmp_path, capsys, missing):
-    """The stage would have no error along the other axis."""
+@pytest.mark.parametrize(
+    ("missing", "line"),
+    [
+        ("theta", "a line without the indicated angle; add a column theta"),
+        ("offset_x", "one of offset_x and offset_y without the other"),
+        ("offset_y", "one of offset_x and offset_y without the other"),
+    ],
+)
+def test_a_column_that_would_count_as_0_is_missed(
+    cell, tmp_path, capsys, missing, line
+):
     first, *others = rows_of(cell)
     columns = [column for column in first if column != missing]
     table = write(tmp_path / "r.csv", [first, *others], columns)
     assert detect(table, tmp_path / "bag") == 2
     [printed] = capsys.readouterr().err.splitlines()
-    assert "one of offset_x and offset_y without the other" in printed
-    assert not (tmp_path / "bag").exists()
+    assert line in printed and not (tmp_path / "bag").exists()
 
 
 def test_what_is_of_images_is_refused_beside_a_table(cell, tmp_path, capsys):
