@@ -172,7 +172,9 @@ def test_every_pin_has_the_hashes_of_its_files(name):
     assert "--require-hashes" in (ROOT / "tools/setup.sh").read_text()
 
 
-@pytest.mark.parametrize("name", ["a'b", "a$b", "a=b", "a;b", "a:b", "a\\b"])
+@pytest.mark.parametrize(
+    "name", ["a'b", 'a"b', "a$b", "a=b", "a,b", "a;b", "a:b", "a\\b"]
+)
 def test_a_folder_that_the_tools_of_ros_cannot_take_is_named_first(tmp_path, name):
     """It ended in errors of CMake after half a minute."""
     setup = tmp_path / name / "tools" / "setup.sh"
